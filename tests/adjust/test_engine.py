@@ -268,10 +268,9 @@ def line_points(m=40, seed=0, sigma=(0.05, 0.02)):
     return np.column_stack([t, 1.0 + 0.5 * t]) + rng.normal(size=(m, 2)) * sigma
 
 
-@pytest.mark.parametrize("jacobians", [line_jacobians, None])
-def test_a_line_with_errors_in_both_coordinates_is_that_of_total_least_squares(jacobians):
+def test_a_line_with_errors_in_both_coordinates_is_that_of_total_least_squares():
     points = line_points(sigma=(0.05, 0.05))
-    problem = GaussHelmert(line_conditions, points, 0.05, Parameters("ab", [0.0, 0.0]), jacobians)
+    problem = GaussHelmert(line_conditions, points, 0.05, Parameters("ab", [0.0, 0.0]), line_jacobians)
     fit = adjust(problem).required()
     centred = points - points.mean(axis=0)
     direction = np.linalg.svd(centred)[2][0]
@@ -284,41 +283,29 @@ def test_a_line_with_errors_in_both_coordinates_is_that_of_total_least_squares(j
     assert fit.redundancy == len(points) - 2
 
 
-def test_conditions_in_blocks_and_in_one_are_the_same():
-    points = line_points(m=12)
-    rng = np.random.default_rng(4)
-    blocks = np.stack([spd(rng, 2) * 10 for _ in points])
-    marks = adjust(
-        GaussHelmert(line_conditions, points, blocks, Parameters("ab", [0.0, 0.0]), line_jacobians)
-    ).required()
-    whole = np.zeros((24, 24))
-    for i, block in enumerate(blocks):
-        whole[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = block
-    flat = adjust(
-        GaussHelmert(
-            lambda flat, x: line_conditions(flat.reshape(-1, 2), x)[:, 0],
-            points.ravel(),
-            whole,
-            Parameters("ab", [0.0, 0.0]),
-        )
-    ).required()
-    full = adjust(
-        GaussHelmert(line_conditions, points, whole, Parameters("ab", [0.0, 0.0]), line_jacobians)
-    ).required()
-    for other in (flat, full):
-        np.testing.assert_allclose(marks.values, other.values, atol=1e-8)
-        np.testing.assert_allclose(marks.cofactor, other.cofactor, rtol=1e-5)
-        np.testing.assert_allclose(marks.w.ravel(), other.w.ravel(), atol=1e-4)
-        np.testing.assert_allclose(
-            marks.redundancy_numbers.ravel(), other.redundancy_numbers.ravel(), atol=1e-6
-        )
+def test_standard_deviations_and_blocks_of_marks_are_the_same_covariance():
+    points, sigma = line_points(m=12), np.tile([0.05, 0.02], (12, 1))
+    blocks = sigma[:, :, None] ** 2 * np.eye(2)
+    start = Parameters("ab", [0.0, 0.0])
+    a, b = (
+        adjust(GaussHelmert(line_conditions, points, cov, start, line_jacobians)).required()
+        for cov in (sigma, blocks)
+    )
+    np.testing.assert_allclose(a.values, b.values, rtol=1e-12)
+    np.testing.assert_allclose(a.cofactor, b.cofactor, rtol=1e-12)
+    whole = np.diag(sigma.ravel() ** 2)
+    with pytest.raises(UsageError, match="one mark into another"):
+        adjust(GaussHelmert(line_conditions, points, whole, start, line_jacobians))
 
 
 def test_gauss_helmert_is_gauss_markov_when_the_conditions_are_observation_equations():
     y = noisy()
-    helmert = GaussHelmert(
-        lambda obs, x: decay(x)[:, None] - obs, y[:, None], 0.01, Parameters("abc", [1.0, 1.0, 0.0])
-    )
+
+    def jacobians(observed, x):
+        return decay_jacobian(x)[:, None], -np.ones((len(y), 1, 1))
+
+    start = Parameters("abc", [1.0, 1.0, 0.0])
+    helmert = GaussHelmert(lambda obs, x: decay(x)[:, None] - obs, y[:, None], 0.01, start, jacobians)
     a, b = adjust(helmert).required(), adjust(decay_problem(y)).required()
     np.testing.assert_allclose(a.values, b.values, atol=1e-9)
     np.testing.assert_allclose(a.residuals.ravel(), b.residuals, atol=1e-9)
@@ -330,7 +317,11 @@ def test_gauss_helmert_is_gauss_markov_when_the_conditions_are_observation_equat
 def test_gauss_helmert_redundancy_numbers_sum_to_the_redundancy():
     fit = adjust(
         GaussHelmert(
-            line_conditions, line_points(), [0.05, 0.02] * np.ones((40, 2)), Parameters("ab", [0, 0])
+            line_conditions,
+            line_points(),
+            [0.05, 0.02] * np.ones((40, 2)),
+            Parameters("ab", [0, 0]),
+            line_jacobians,
         )
     ).required()
     assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-7)
@@ -453,7 +444,7 @@ def test_a_covariance_that_does_not_fit_is_an_error(covariance, words):
         lambda: decay_problem(weights=-np.ones(30)),
         lambda: adjust(decay_problem(jacobian=lambda x: np.zeros((3, 3)))),
         lambda: adjust(GaussMarkov(lambda x: x, np.zeros(3), 1.0, Parameters("ab", [0.0, 0.0]))),
-        lambda: GaussHelmert(line_conditions, np.zeros((2, 2, 2)), 1.0, Parameters("ab", [0.0, 0.0])),
+        lambda: GaussHelmert(line_conditions, np.zeros(4), 1.0, Parameters("ab", [0.0, 0.0]), line_jacobians),
         lambda: adjust(decay_problem()).required()["d"],
         lambda: adjust(decay_problem(parameters=Parameters("abc", TRUE, "ab"))).required().test_of("c"),
     ],

@@ -40,15 +40,19 @@ def markov(jacobian=derivatives):
 
 def helmert(jacobian=derivatives):
     def both(observed, x):
-        return -jacobian(x), np.eye(len(T))
+        return -jacobian(x)[:, None], np.ones((len(T), 1, 1))
 
     return GaussHelmert(
-        lambda observed, x: observed - decay(x), NOISY, 0.02, Parameters("abc", [1.0, 1.0, 0.0]), both
+        lambda observed, x: observed - decay(x)[:, None],
+        NOISY[:, None],
+        0.02,
+        Parameters("abc", [1.0, 1.0, 0.0]),
+        both,
     )
 
 
 def grouped(problem, options):
-    half = np.arange(len(T)) < len(T) // 2
+    half = (np.arange(len(T)) < len(T) // 2).reshape(problem.observations.shape)
     found = variance_components(problem, {"first": half, "second": ~half}, options)
     return found if isinstance(found, Failure) else found.adjustment
 

@@ -39,7 +39,11 @@ def marks(seed=0, rows=()):
     def conditions(p, x):
         return (x[0] + x[1] * p[:, 0] - p[:, 1])[:, None]
 
-    return GaussHelmert(conditions, xy, 0.1, Parameters("ab", [0.0, 0.0]))
+    def jacobians(p, x):
+        a = np.stack([np.ones(len(p)), p[:, 0]], axis=1)
+        return a[:, None], np.tile([x[1], -1.0], (len(p), 1, 1))
+
+    return GaussHelmert(conditions, xy, 0.1, Parameters("ab", [0.0, 0.0]), jacobians)
 
 
 def test_snooping_finds_the_blunders_and_nothing_else():

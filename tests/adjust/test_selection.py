@@ -127,7 +127,12 @@ def test_variance_components_of_two_kinds_of_observations_in_marks():
     def conditions(p, x):
         return (x[0] * np.sin(p[:, 0]) + x[1] - p[:, 1])[:, None]
 
-    problem = GaussHelmert(conditions, xy, 0.01, Parameters("ab", [1.0, 0.0]))
+    def jacobians(p, x):
+        a = np.stack([np.sin(p[:, 0]), np.ones(len(p))], axis=1)
+        b = np.stack([x[0] * np.cos(p[:, 0]), -np.ones(len(p))], axis=1)
+        return a[:, None], b[:, None]
+
+    problem = GaussHelmert(conditions, xy, 0.01, Parameters("ab", [1.0, 0.0]), jacobians)
     every = {"all": np.ones((60, 2), bool)}
     found = variance_components(problem, every).required()
     assert found["all"] == pytest.approx(5.0, abs=4 * found.sigma[0])

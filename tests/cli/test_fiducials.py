@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from reseau.exchange.film import read_micmac
 from reseau.io import FiducialDesign
 from reseau.io.images import read_image, write_image
 
@@ -61,10 +61,11 @@ def test_an_oriented_scan_is_exported_to_micmac_and_metashape(files, tmp_path: P
     script = tmp_path / "marks.py"
     status, _, _ = reseau("export", tmp_path / "photo.json", "--micmac", tmp_path, "--metashape", script)
     assert status == 0
-    (found,) = read_micmac(tmp_path)
+    root = ET.parse(tmp_path / "Ori-InterneScan" / "MeasuresCamera.xml").getroot()
+    mm = np.array([each.text.split() for each in root.iter("PtIm")], dtype=float)
     expected = camera(UNEVEN)
-    assert found.names == expected.ids
-    assert np.abs(found.mm - (expected.xy - [-20.0, 15.0])).max() < 1e-4  # mm
+    assert tuple(each.text for each in root.iter("NamePt")) == expected.ids
+    assert np.abs(mm - (expected.xy - [-20.0, 15.0]) * [1, -1]).max() < 1e-4
     assert "Marker.Type.Fiducial" in script.read_text()
     status, _, err = reseau("export", tmp_path / "photo.json")
     assert status == 2

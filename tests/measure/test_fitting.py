@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from reseau.adjust import Adjustment, Options, adjust
+from reseau.adjust.differences import differences
 from reseau.adjust.elimination import Elimination
 from reseau.core.data import ImagePoints
 from reseau.core.errors import UsageError
@@ -85,10 +86,11 @@ def test_every_family_is_recovered_from_points_without_noise(name):
 @pytest.mark.parametrize("name", families())
 def test_the_jacobians_of_the_conditions_are_correct(name):
     model = families()[name]
-    problem, at = mapping_problem(approximate(model), points(XY), model(XY)).model(), np.array(model.values)
-    problem.evaluate(problem.carry(at))
-    observed = problem.problem.observations.ravel()
-    for own, numeric in zip(problem.derivatives(observed, at), problem.numeric(observed, at), strict=True):
+    problem, at = mapping_problem(approximate(model), points(XY), model(XY)), np.array(model.values)
+    by_parameters = differences(lambda x: problem.conditions(XY, x), at)
+    # All points are shifted alike: each condition depends on its own only.
+    by_points = differences(lambda shift: problem.conditions(XY + shift, at), np.zeros(2))
+    for own, numeric in zip(problem.jacobians(XY, at), (by_parameters, by_points), strict=True):
         size = np.abs(numeric).max(axis=(0, 1))
         assert (np.abs(own - numeric) <= 1e-7 * np.where(size > 0, size, 1.0)).all()
 

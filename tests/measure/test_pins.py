@@ -360,7 +360,7 @@ FOUR = np.array([[0.0, 0.0], [30.1, 0.9], [0.7, -15.1], [30.5, -16.0]])
 @pytest.mark.parametrize("seed", range(6))
 def test_four_rods_are_not_laid_over_echoes_of_other_things(seed: int):
     others = np.random.default_rng(seed).uniform([15, 15], [585, 385], (16, 2))
-    layout = lay_wires(Wires.of_points(tuple("abcd"), FOUR), others)
+    layout = lay_wires(Wires(tuple("abcd"), FOUR, FOUR), others)
     assert not layout
     if layout.code is Code.AMBIGUOUS:
         assert "by chance" in layout.reason
@@ -369,7 +369,7 @@ def test_four_rods_are_not_laid_over_echoes_of_other_things(seed: int):
 def test_four_rods_that_fit_exactly_are_found_among_others():
     truth = FOUR @ np.array([[5.0, 0.3], [-0.3, 5.0]]) * [1, -1] + [220.3, 150.2]
     others = np.random.default_rng(3).uniform([15, 15], [585, 385], (5, 2))
-    layout = lay_wires(Wires.of_points(tuple("abcd"), FOUR), np.concatenate([others, truth]))
+    layout = lay_wires(Wires(tuple("abcd"), FOUR, FOUR), np.concatenate([others, truth]))
     assert layout
     assert (np.sort(layout.row) == [5, 6, 7, 8]).all()
 

@@ -302,13 +302,9 @@ def test_rules_that_changed_need_a_new_version(archive: Archive) -> None:
     assert known.decide("left", camera(c=8.001), newer, since=day(7)).judgement.rules["version"] == 2
 
 
-def test_a_configuration_is_found_by_the_parts_of_a_frame(archive: Archive) -> None:
+def test_a_configuration_has_parts_of_its_own(archive: Archive) -> None:
     known, _ = started(archive)
     known.define("right", {"camera": "DMK 34", "lens": "8 mm f/8"})
-    assert known.find({"camera": "DMK 34", "lens": "8 mm f/8", "firmware": "2"}) == "right"
-    for parts in ({"camera": "DMK 35", "lens": "8 mm f/8"}, {"lens": "8 mm f/8"}):
-        with pytest.raises(UsageError, match="no configuration has these parts"):
-            known.find(parts)
     with pytest.raises(UsageError, match="exists with other parts"):
         known.define("left", {"camera": "other"})
     with pytest.raises(UsageError, match="has the parts of left"):

@@ -58,8 +58,7 @@ class Fitted(Estimated):
     @property
     def adjusted(self) -> Array:
         """Adjusted observations, observed + residuals."""
-        adjusted: Array = self._observed.observations.astype(np.float64) + self.residuals
-        return adjusted
+        return self._observed.observations.astype(np.float64) + self.residuals
 
     @property
     def rejected(self) -> Mask:

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ..core.data import Array
@@ -264,34 +263,35 @@ class MarkovModel(Model):
 
 
 class HelmertModel(Model):
-    """g(l + v, x) = 0, in b groups of c conditions and k observations; a single group where they mix."""
+    """g(l + v, x) = 0 of m marks, with c conditions and k observations each."""
 
-    constant_weights = False
+    analytic, constant_weights = True, False
 
-    def __init__(self, problem: Specification, conditions: Conditions, jacobians: Jacobians | None) -> None:
+    def __init__(self, problem: Specification, conditions: Conditions, jacobians: Jacobians) -> None:
         super().__init__(problem)
         self._given_conditions, self._jacobians = conditions, jacobians
-        shape = problem.observations.shape
-        blocks = blocks_of(problem.covariance, shape)
-        self.grouped = len(shape) == 2
-        groups, k = shape if self.grouped else (1, problem.size)
-        if self.grouped and not _fits(blocks, k):
-            groups, k = 1, problem.size
-        self.groups, self.k = groups, k
-        self.weighting = Weighting([_regrouped(blocks, groups, k)], self._whole_groups())
+        self.marks, self.k = problem.observations.shape
+        self.weighting = Weighting([self._blocks()], self._whole_marks())
         self.covariances = self.weighting.cofactors[0].matrices
 
-    def _whole_groups(self) -> Array | None:
+    def _blocks(self) -> Array:
+        """The covariance as blocks (m, k, k)."""
+        index, out = np.arange(self.k), []
+        for part in blocks_of(self.problem.covariance, self.problem.observations.shape):
+            if part.shape[1] not in (1, self.k) or part.size // part.shape[1] % self.k:
+                raise UsageError("reaches from one mark into another", where="covariance")
+            if part.shape[1] != self.k:
+                part, sigma = np.zeros((len(part) // self.k, self.k, self.k)), part
+                part[:, index, index] = sigma.reshape(-1, self.k)
+            out.append(part)
+        return np.concatenate(out)
+
+    def _whole_marks(self) -> Array | None:
         if self.factors is None:
             return None
-        factors = self.factors.reshape(self.groups, self.k)
-        out = (factors == 0).any(axis=1)
-        if out.any() and self.groups == 1:
-            raise UsageError(
-                "cannot leave out an observation of conditions that share all of them", where="weights"
-            )
-        self.outside = out
-        self.factors = np.where(out[:, None], 0.0, factors).ravel()
+        factors = self.factors.reshape(self.marks, self.k)
+        self.outside = (factors == 0).any(axis=1)
+        self.factors = np.where(self.outside[:, None], 0.0, factors).ravel()
         return self.factors
 
     @property
@@ -299,55 +299,22 @@ class HelmertModel(Model):
         """Conditions of the marks left out."""
         return 0 if self.factors is None else int(self.outside.sum()) * self._conditions_each
 
-    @property
-    def analytic(self) -> bool:
-        """Whether Jacobians were given."""
-        return self._jacobians is not None
-
     def _conditions(self, observed: Array, x: Array) -> Array:
-        g = np.asarray(
-            self._given_conditions(observed.reshape(self.problem.observations.shape), x), dtype=float
-        )
-        if self.grouped and g.ndim and g.shape[0] == len(self.problem.observations):
-            self._conditions_each = g.size // self.groups
-        elif self.grouped or g.ndim != 1:
-            raise UsageError(f"gave {g.shape} of {self.problem.observations.shape}", where="conditions")
-        else:
-            self._conditions_each = g.size
-        return g.reshape(self.groups, self._conditions_each)
+        shape = self.problem.observations.shape
+        g = np.asarray(self._given_conditions(observed.reshape(shape), x), dtype=float)
+        if not g.ndim or g.shape[0] != self.marks:
+            raise UsageError(f"gave {g.shape} of {shape}", where="conditions")
+        self._conditions_each = g.size // self.marks
+        return g.reshape(self.marks, self._conditions_each)
 
     def derivatives(self, observed: Array, x: Array) -> tuple[Array, Array]:
-        """A (b, c, u) and B (b, c, k)."""
-        if self._jacobians is None:
-            return self.numeric(observed, x)
-        shape, u = self.problem.observations.shape, len(self.names)
-        a, b = self._jacobians(observed.reshape(shape), x)
+        """A (m, c, u) and B (m, c, k)."""
+        a, b = self._jacobians(observed.reshape(self.problem.observations.shape), x)
         a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
-        rows = self.groups * self._conditions_each
-        if (self.grouped and b.shape != (shape[0], rows // shape[0], shape[1])) or a.size != rows * u:
+        rows = self.marks, self._conditions_each
+        if b.shape != (*rows, self.k) or a.size != rows[0] * rows[1] * len(self.names):
             raise UsageError(f"gave A {a.shape} and B {b.shape}", where="jacobians")
-        return a.reshape(self.groups, -1, u), self._in_groups(b)
-
-    def _in_groups(self, b: Array) -> Array:
-        if self.grouped and self.groups == 1:
-            b = scipy.linalg.block_diag(*b)
-        return b.reshape(self.groups, self._conditions_each, self.k)
-
-    def numeric(self, observed: Array, x: Array) -> tuple[Array, Array]:
-        """The same by differences; those of one column of all marks at once."""
-        a = differences(lambda y: self._conditions(observed, y), x, self.mask)
-        if not self.grouped:
-            b = differences(lambda y: self._conditions(y, x).ravel(), observed)
-            return a, b[None]
-        marks, k = self.problem.observations.shape
-        l0 = observed.reshape(marks, k)
-        step = np.maximum(np.abs(l0).max(axis=0), 1.0)
-
-        def moved(t: Array) -> Array:
-            return self._conditions((l0 + (t - 1.0) * step).ravel(), x).reshape(marks, -1)
-
-        b = differences(moved, np.ones(k)) / step
-        return a, self._in_groups(b)
+        return a.reshape(*rows, -1), b
 
     def _evaluate(self, x: Values, near: State | None) -> State | None:
         l0, at = self.problem.observations.ravel(), x.astype(np.float64)
@@ -356,7 +323,7 @@ class HelmertModel(Model):
         for _ in range(_INNER):
             g = self._conditions(l0 + v, at)
             _, b = self.derivatives(l0 + v, at)
-            w = g - (b @ v.reshape(self.groups, self.k, 1))[..., 0]
+            w = g - (b @ v.reshape(self.marks, self.k, 1))[..., 0]
             state = self._solve(x, w, b)
             if state is None:
                 return None
@@ -376,10 +343,7 @@ class HelmertModel(Model):
             lower = np.linalg.cholesky(m)
         except np.linalg.LinAlgError:
             return None
-        if self.groups == 1:
-            inverse = scipy.linalg.solve_triangular(lower[0], np.eye(len(lower[0])), lower=True)[None]
-        else:
-            inverse = np.linalg.inv(lower)
+        inverse = np.linalg.inv(lower)
         r = inverse @ w[..., None]
         v = -np.swapaxes(bq, 1, 2) @ (np.swapaxes(inverse, 1, 2) @ r)
         if self.factors is not None:
@@ -393,9 +357,7 @@ class HelmertModel(Model):
         """Covariances where marks left out keep theirs, so that their residuals are still found."""
         if self.factors is None or not self.outside.any():
             return self.covariances
-        whole = self.problem.covariance
-        given = _regrouped(blocks_of(whole, self.problem.observations.shape), self.groups, self.k)
-        return np.where(self.outside[:, None, None], given, self.covariances)
+        return np.where(self.outside[:, None, None], self._blocks(), self.covariances)
 
     def _design(self, state: State) -> Array:
         assert state.root is not None
@@ -407,26 +369,3 @@ class HelmertModel(Model):
         assert state.root is not None
         assert state.derivatives is not None
         return [Blocks(0, 0, -np.swapaxes(state.root.matrices @ state.derivatives, 1, 2))]
-
-
-def _fits(blocks: list[Array], k: int) -> bool:
-    """Whether no block reaches from one mark into another."""
-    return all(part.shape[1] == 1 or (part.shape[1] == k) for part in blocks) and all(
-        part.shape[0] * part.shape[1] % k == 0 for part in blocks
-    )
-
-
-def _regrouped(blocks: list[Array], groups: int, k: int) -> Array:
-    """The covariance as blocks (groups, k, k)."""
-    if groups == 1:
-        return np.asarray(scipy.linalg.block_diag(*[matrix for part in blocks for matrix in part]))[None]
-    index = np.arange(k)
-    out = []
-    for part in blocks:
-        if part.shape[1] == k:
-            out.append(part)
-            continue
-        wide = np.zeros((len(part) // k, k, k))
-        wide[:, index, index] = part.reshape(-1, k)
-        out.append(wide)
-    return np.concatenate(out)

@@ -434,8 +434,7 @@ class _Rounds(Generic[F]):
             return mask
         touched = np.zeros(int(self.marks.max(initial=-1)) + 1, dtype=bool)
         touched[self.marks[mask]] = True
-        whole: Mask = touched[self.marks]
-        return whole
+        return touched[self.marks]
 
     def mark(self, place: tuple[int, ...]) -> Mask | tuple[int, ...]:
         """The observations that are rejected together with one observation."""

@@ -141,18 +141,16 @@ class GaussHelmert(Problem):
     Parameters
     ----------
     conditions : callable
-        `conditions(l, x)` with l of the observations' shape and x (u,), all parameters. Of observations (n,)
-        it gives the conditions (r,). Of observations (m, k), m marks of k coordinates, it gives (m, c): c
-        conditions for each mark, independent of the other marks. Then no matrix of the size (n, n) is formed.
-    observations : array_like (n,) or (m, k)
+        `conditions(l, x)` with l (m, k) and x (u,), all parameters: (m, c), c conditions for each of m marks
+        of k coordinates, independent of the other marks. So no matrix of the size (n, n) is formed.
+    observations : array_like (m, k)
         Observations.
     covariance : array_like, optional
-        As in :class:`GaussMarkov`.
+        As in :class:`GaussMarkov`, in which no block reaches from one mark into another.
     parameters : Parameters
         Names, approximate values, which are free, and what was observed of them.
-    jacobians : callable, optional
-        `jacobians(l, x)` gives A = ∂g/∂x and B = ∂g/∂l: (r, u) and (r, n), or (m, c, u) and (m, c, k). By
-        default differences of `conditions`.
+    jacobians : callable
+        `jacobians(l, x)` gives A = ∂g/∂x (m, c, u) and B = ∂g/∂l (m, c, k).
     weights
         As in :class:`GaussMarkov`; weight zero of one observation leaves its whole mark out.
 
@@ -167,8 +165,11 @@ class GaussHelmert(Problem):
 
     >>> xy = np.array([[0.0, 1.1], [1.0, 2.9], [2.0, 5.1], [3.0, 6.9]])
     >>> conditions = lambda l, x: (x[0] + x[1] * l[:, 0] - l[:, 1])[:, None]
-    >>> fit = GaussHelmert(conditions, xy, 0.1, Parameters("ab", [0.0, 1.0])).adjusted().required()
-    >>> round(fit["b"], 3)
+    >>> def jacobians(l, x):
+    ...     a = np.stack([np.ones(len(l)), l[:, 0]], axis=1)
+    ...     return a[:, None], np.tile([x[1], -1.0], (len(l), 1, 1))
+    >>> line = GaussHelmert(conditions, xy, 0.1, Parameters("ab", [0.0, 1.0]), jacobians)
+    >>> round(line.adjusted().required()["b"], 3)
     1.963
     """
 
@@ -176,13 +177,13 @@ class GaussHelmert(Problem):
     observations: Array
     covariance: Covariance
     parameters: Parameters
-    jacobians: Jacobians | None = None
+    jacobians: Jacobians
     weights: Array | None = None
 
     def __post_init__(self) -> None:
         _tidy(self)
-        if self.observations.ndim not in (1, 2) or self.observations.dtype != np.float64:
-            raise UsageError("observations must be numbers (n,) or (m, k)", where="GaussHelmert")
+        if self.observations.ndim != 2 or self.observations.dtype != np.float64:
+            raise UsageError("observations must be numbers (m, k)", where="GaussHelmert")
         self._check()
 
     def model(self) -> Model:
@@ -192,12 +193,7 @@ class GaussHelmert(Problem):
     @property
     def marks(self) -> NDArray[np.intp] | None:
         """Numbers of the marks, where each has conditions and a covariance of its own."""
-        if self.observations.ndim != 2:
-            return None
         m, k = self.observations.shape
-        blocks = blocks_of(self.covariance, self.observations.shape)
-        if not all(part.shape[1] in (1, k) for part in blocks):
-            return None
         return np.broadcast_to(np.arange(m)[:, None], (m, k))
 
 
@@ -332,8 +328,7 @@ class Adjustment(Fitted):
     @property
     def sigma(self) -> Array:
         """Standard deviations of all parameters (u,), scaled according to `scale`; zero for fixed ones."""
-        sigma: Array = np.sqrt(np.diag(self.covariance))
-        return sigma
+        return np.sqrt(np.diag(self.covariance))
 
     def sigma_of(self, name: str) -> float:
         """Standard deviation of one parameter, scaled according to `scale`."""

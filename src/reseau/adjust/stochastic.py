@@ -42,8 +42,7 @@ class Blocks:
         if k == m == 1:
             flat = self.matrices[:, 0, 0]
             return flat * part if part.ndim == 1 else flat[:, None] * part
-        product: Array = (self.matrices @ part.reshape(b, m, -1)).reshape(b * k, *part.shape[1:])
-        return product
+        return (self.matrices @ part.reshape(b, m, -1)).reshape(b * k, *part.shape[1:])
 
     @property
     def transposed(self) -> Blocks:

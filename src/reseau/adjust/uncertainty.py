@@ -389,8 +389,7 @@ def simulate(
 def _described(y: Array, probability: float) -> Array:
     """Mean, standard deviation and ends of the interval of each result (4, m)."""
     ends = np.quantile(y, [(1.0 - probability) / 2, (1.0 + probability) / 2], axis=0)
-    found: Array = np.stack([y.mean(axis=0), y.std(axis=0, ddof=1), *ends])
-    return found
+    return np.stack([y.mean(axis=0), y.std(axis=0, ddof=1), *ends])
 
 
 def _joint(y: Array, probability: float) -> Array:
@@ -422,8 +421,7 @@ def _standard_error(of_batches: Array) -> Array:
 def _tolerance(u: Array, digits: int) -> Array:
     """Half of a unit of the last of the significant digits of u (JCGM 101, 7.9.2)."""
     known = np.where(u > 0, u, 1.0)
-    found: Array = np.where(u > 0, 0.5 * 10.0 ** (np.floor(np.log10(known)) - digits + 1), 0.5)
-    return found
+    return np.where(u > 0, 0.5 * 10.0 ** (np.floor(np.log10(known)) - digits + 1), 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -560,8 +558,7 @@ def _degrees(total: Array, parts: Sequence[tuple[Array, float]]) -> Array:
     for part, degrees in parts:
         if np.isfinite(degrees):
             sums += part**2 / degrees
-    found: Array = np.where(sums > 0, total**2 / np.where(sums > 0, sums, 1.0), np.inf)
-    return found
+    return np.where(sums > 0, total**2 / np.where(sums > 0, sums, 1.0), np.inf)
 
 
 def _whitening(covariance: Array) -> tuple[Array, int]:
@@ -577,8 +574,7 @@ def _whitening(covariance: Array) -> tuple[Array, int]:
 
 
 def _sigma(covariance: Array) -> Array:
-    found: Array = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    return found
+    return np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
 
 
 def _check(probability: float) -> None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from ..adjust.significance import CoefficientTest
 from ..core.data import Array
 from ..core.data import Rows as Indices
 from ..core.provenance import Provenance
@@ -25,6 +24,7 @@ from .network.rig import Rig
 Column = tuple[float | None, ...]
 Rows = tuple[tuple[float, ...] | None, ...]
 Matrix = tuple[tuple[float, ...], ...]
+P = TypeVar("P", bound=Strict)
 
 
 class Estimate(Strict):
@@ -358,10 +358,7 @@ class ResultDocument(Document):
             images=_images(result),
             points=_points(result, covariances),
             image_points=_image_points(result),
-            global_test=None if test is None else GlobalTestResult(
-                statistic=test.statistic, redundancy=test.redundancy, lower=test.lower, upper=test.upper,
-                p=test.p, passed=test.passed,
-            ),
+            global_test=None if test is None else _of(GlobalTestResult, test),
             warnings=tuple(remark.text for remark in result.warnings),
             warning_codes=tuple(remark.code.value for remark in result.warnings),
             status=result.status,
@@ -399,20 +396,12 @@ def _model_search(result: Result) -> dict[str, Any]:
     found: dict[str, Any] = {}
     components = result.components
     if components is not None:
-        found["variance_components"] = ComponentsResult(
-            names=tuple(components.names),
-            factors=tuple(components.factors.tolist()),
-            sigma=tuple(components.sigma.tolist()),
-            redundancy=tuple(components.redundancy.tolist()),
-        )
+        found["variance_components"] = _of(ComponentsResult, components)
     if result.eliminated is not None:
         found["eliminated"] = tuple(
-            EliminatedParameter(
-                camera=step.camera, name=step.test.name, statistic=_number(step.test.statistic),
-                critical=step.test.critical, p=step.test.p, sigma0=_number(step.sigma0),
-            )
+            _of(EliminatedParameter, step.test, camera=step.camera, sigma0=step.sigma0)
             for step in result.eliminated
-        )  # fmt: skip
+        )
     if result.validation is not None:
         found["cross_validation"] = CrossValidation(all=result.validation[0], kept=result.validation[1])
     return found
@@ -434,21 +423,14 @@ def _camera(result: Result, c: int) -> CameraResult:
         sigma_formal=dict(zip(found.parameters, found.sigma_formal.tolist(), strict=True)),
         degrees_of_freedom=dict(zip(found.parameters, degrees, strict=True)),
         correlation=Correlation(names=found.parameters, matrix=_matrix(found.correlation)),
-        tests={test.name: _significance(test) for test in result.camera_tests(c)},
+        tests={test.name: _of(Significance, test) for test in result.camera_tests(c)},
         **more,
     )
 
 
 def _priors(found: PriorInfluence, over: Regularised | None) -> PriorResult:
-    columns = (found.given, found.sigma_given, found.share, found.sigma, found.sigma_images)
-    given, sigma_given, share, sigma, images = (tuple(column.tolist()) for column in columns)
-    return PriorResult(
-        parameter=found.parameters, given=given, sigma_given=sigma_given, share=share, sigma=sigma,
-        sigma_images=images, determined=found.determined, sigma0=_number(found.sigma0),
-        regularisation=None if over is None else RegularisationResult(
-            area=over.area, regions=over.regions, sigma=over.largest, where_observed=over.where_observed
-        ),
-    )  # fmt: skip
+    field = None if over is None else _of(RegularisationResult, over, sigma=over.largest)
+    return _of(PriorResult, found, parameter=found.parameters, regularisation=field)
 
 
 def _refraction(result: Result, bent: Refraction) -> RefractionResult:
@@ -464,65 +446,52 @@ def _refraction(result: Result, bent: Refraction) -> RefractionResult:
         },
         given=dict(zip(bent.names, bent.values.tolist(), strict=True)),
         correlation=Correlation(names=names, matrix=() if found is None else _matrix(found.correlation)),
-        tests={} if found is None else {test.name: _significance(test) for test in found.tests},
+        tests={} if found is None else {test.name: _of(Significance, test) for test in found.tests},
         partners={} if found is None else dict(zip(names, found.partners, strict=True)),
     )
 
 
 def _rig(found: RigEstimate) -> RigResult:
-    return RigResult(
+    rotation = matrix_to_vector(found.rotation)
+    return _of(
+        RigResult,
+        found,
         camera=found.cameras,
         reference=found.references,
-        rotation=_matrix(matrix_to_vector(found.rotation)),
-        base=_matrix(found.base),
-        sigma=_matrix(found.sigma),
-        length=tuple(found.length.tolist()),
-        length_sigma=tuple(found.length_sigma.tolist()),
-        covariance=tuple(_matrix(cov) for cov in found.cov),
+        rotation=rotation,
+        covariance=found.cov,
     )
 
 
 def _turntable(found: StageEstimate) -> TurntableResult:
-    return TurntableResult(
-        carries=found.carries,
-        direction=tuple(found.direction.tolist()),
+    return _of(
+        TurntableResult,
+        found,
         direction_sigma_deg=math.degrees(found.direction_sigma),
-        position=tuple(found.position.tolist()),
-        position_sigma=found.position_sigma,
-        covariance=_matrix(found.cov),
+        covariance=found.cov,
         image=found.images,
-        angle_deg=_column(np.degrees(found.reading)),
-        sigma_deg=_column(np.degrees(found.reading_sigma)),
-        residual_deg=_column(np.degrees(found.residual)),
+        angle_deg=np.degrees(found.reading),
+        sigma_deg=np.degrees(found.reading_sigma),
+        residual_deg=np.degrees(found.residual),
     )
 
 
 def _motion(found: MotionEstimates) -> MotionResult:
-    return MotionResult(
-        image=found.names,
-        motion=_matrix(found.values),
-        sigma=_matrix(found.sigma),
-        tests={test.name: _significance(test) for test in found.tests},
-    )
-
-
-def _significance(test: CoefficientTest) -> Significance:
-    return Significance(
-        statistic=_number(test.statistic), critical=test.critical, p=test.p, significant=test.significant
-    )
+    tests = {test.name: _of(Significance, test) for test in found.tests}
+    return _of(MotionResult, found, image=found.names, motion=found.values, tests=tests)
 
 
 def _images(result: Result) -> ImagesResult:
     images = result.images
-    return ImagesResult(
+    return _of(
+        ImagesResult,
+        images,
         id=images.names,
         camera=images.cameras,
-        X0=_rows(images.x0),
-        rotation=_rows(images.rotation),
-        sigma=_rows(images.sigma),
-        angles_deg=_rows(np.degrees(result.angles)),
-        angles_sigma_deg=_rows(np.degrees(result.angle_sigma)),
-        factors=_rows(result.variance_factors),
+        X0=images.x0,
+        angles_deg=np.degrees(result.angles),
+        angles_sigma_deg=np.degrees(result.angle_sigma),
+        factors=result.variance_factors,
     )
 
 
@@ -602,6 +571,22 @@ def _lengths(result: Result, ends: Indices, names: Sequence[str], rows: slice) -
         r=_column(result.fit.redundancy_numbers[rows]),
         w=_column(np.abs(result.fit.w[rows]) / sigma0),
     )
+
+
+def _of(part: type[P], source: object, **others: Any) -> P:
+    """A part of the document: the attributes of the same names, and others."""
+    same = part.model_fields.keys() - others.keys()
+    found = {name: getattr(source, name) for name in same if hasattr(source, name)} | others
+    return part(**{name: _plain(value) for name, value in found.items()})
+
+
+def _plain(value: Any) -> Any:
+    """A value as documents have it: arrays as tuples, and nothing in place of what is not finite."""
+    if isinstance(value, np.ndarray):
+        if value.ndim > 2:
+            return tuple(map(_matrix, value))
+        return _rows(value) if value.ndim == 2 else _column(value)
+    return _number(value) if isinstance(value, float) else value
 
 
 def _number(value: float) -> float | None:

@@ -361,12 +361,10 @@ def referred(by_rotation: Array, slope: Array, root: Array | None = None) -> Arr
     g, flat = (each.reshape(2 * len(slope), each.shape[2]) for each in (by_rotation, slope))
     weight = np.ones((len(g), 1)) if root is None else np.repeat(root, 2)[:, None]
     part = np.linalg.lstsq(weight * g, weight * flat, rcond=None)[0]
-    free: Array = (flat - g @ part).reshape(slope.shape)
-    return free
+    return (flat - g @ part).reshape(slope.shape)
 
 
 def worst(cov: Array) -> Array:
     """Root of the larger eigenvalue of 2×2 covariances."""
     a, b, c = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]
-    worst: Array = np.sqrt(np.maximum((a + c) / 2 + np.hypot((a - c) / 2, b), 0.0))
-    return worst
+    return np.sqrt(np.maximum((a + c) / 2 + np.hypot((a - c) / 2, b), 0.0))

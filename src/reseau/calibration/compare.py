@@ -256,8 +256,7 @@ def _joint_root(first: CameraMapping, second: CameraMapping, by_first: Array, by
     """A root (g, 2, k) of the covariance of the differences."""
     if type(first.mapping) is type(second.mapping) and first.names == second.names:
         # Derivatives at two estimates differ by their errors, which must not add dimensions of their own.
-        mean: Array = (by_first + by_second) / 2 @ _root(first.covariance + second.covariance)
-        return mean
+        return (by_first + by_second) / 2 @ _root(first.covariance + second.covariance)
     parts = [by_first @ _root(first.covariance), by_second @ _root(second.covariance)]
     return np.concatenate(parts, axis=2)
 

@@ -133,8 +133,7 @@ class FilmFrameMapping(CalibratedMapping):
 
     def _mapped(self, xy: Array) -> Array:
         photo = self._photo(xy, self.corners)
-        mapped: Array = photo if self.transform is None else self.transform(photo)
-        return mapped
+        return photo if self.transform is None else self.transform(photo)
 
     def derivatives(self, xy: Array) -> tuple[Array, Array, Array]:
         """See :meth:`CalibratedMapping.derivatives`."""
@@ -174,8 +173,7 @@ class FilmFrameMapping(CalibratedMapping):
     def to_pixels(self, xy: Array) -> Array:
         """Pixels (n, 2) of photo-coordinates (n, 2) in mm; NaN where the transformation has no inverse."""
         photo = xy if self.transform is None else self.transform.inverse(xy)
-        pixels: Array = photo @ np.linalg.inv(self._linear).T + _axes(self.corners)[0]
-        return pixels
+        return photo @ np.linalg.inv(self._linear).T + _axes(self.corners)[0]
 
     def _why(self, xy: Array, mapped: Array) -> list[str]:
         return reasons(self.extent, mapped, mapped, "the frame")

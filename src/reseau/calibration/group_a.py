@@ -73,8 +73,7 @@ class Datum:
     def added(self) -> Array:
         """What it adds to the covariance matrix of the coefficients, (u, u)."""
         cross = self.influence @ self.shared.T
-        added: Array = cross + cross.T + self.influence @ self.covariance @ self.influence.T
-        return added
+        return cross + cross.T + self.influence @ self.covariance @ self.influence.T
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON-ready data."""

@@ -270,8 +270,7 @@ def _border(size: tuple[int, int]) -> Array:
     """Pixels around the border of an image."""
     along = np.linspace(0, 1, 33)
     edge = np.concatenate([np.stack([along, 0 * along + k], 1) for k in (0, 1)])
-    border: Array = np.concatenate([edge, edge[:, ::-1]]) * (np.array(size) - 1.0)
-    return border
+    return np.concatenate([edge, edge[:, ::-1]]) * (np.array(size) - 1.0)
 
 
 def _affordable(width: int, height: int) -> None:

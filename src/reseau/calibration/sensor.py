@@ -217,8 +217,7 @@ def unpacked(field: dict[str, Any]) -> NDArray[np.float32]:
         raise ValueError(f"{height}×{width} pixels")
     inflated = zlib.decompressobj().decompress(base64.b64decode(field["deflated"]), height * width * 2)
     steps = np.frombuffer(inflated, "<u2").reshape(height, width)
-    values: NDArray[np.float32] = (float(field["low"]) + float(field["step"]) * steps).astype(np.float32)
-    return values
+    return (float(field["low"]) + float(field["step"]) * steps).astype(np.float32)
 
 
 def _mended(signal: NDArray[np.float32], defects: Mask) -> NDArray[np.float32]:

@@ -167,8 +167,7 @@ class ImagePoints(Display):
     @property
     def sigma(self) -> Array:
         """Standard deviations of the coordinates, (n, 2)."""
-        sigma: Array = np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
-        return sigma
+        return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
 
     def _facts(self) -> list[tuple[str, str]]:
         if not len(self):

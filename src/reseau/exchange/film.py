@@ -214,9 +214,8 @@ def write_micmac(folder: Path | str, scans: Sequence[FilmMarks]) -> list[Path]:
     >>> marks = FilmMarks("7.tif", ("a", "b"), xy, mm)
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     files = write_micmac(folder, [marks])
-    ...     again = read_micmac(folder)
-    >>> [file.name for file in files], again[0].mm.tolist()
-    (['MeasuresIm-7.tif.xml', 'MeasuresCamera.xml', 'id_fiducial.txt'], [[0.0, 0.0], [6.0, 0.0]])
+    >>> [file.name for file in files]
+    ['MeasuresIm-7.tif.xml', 'MeasuresCamera.xml', 'id_fiducial.txt']
     """
     camera = _camera(scans)
     names, mm = tuple(camera), np.array(list(camera.values()))
@@ -258,57 +257,6 @@ def _xml(image: str, names: Sequence[str], xy: Array) -> str:
         ET.SubElement(point, "PtIm").text = f"{x:.5f} {y:.5f}"
     ET.indent(root)
     return '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
-
-
-def read_micmac(folder: Path | str) -> list[FilmMarks]:
-    """Read the scans of a folder in which MicMac, or :func:`write_micmac`, wrote measured marks.
-
-    Coordinates in the camera are in mm from MicMac's origin, y up.
-
-    Raises
-    ------
-    FormatError
-        When a file is not of MicMac, or lacks the coordinates of a mark.
-
-    Examples
-    --------
-    See :func:`write_micmac`.
-
-    >>> read_micmac("missing")
-    Traceback (most recent call last):
-    reseau.core.errors.InputError: missing/Ori-InterneScan/MeasuresCamera.xml: cannot be read ...
-    """
-    inner = Path(folder) / _FOLDER
-    _, names, mm = _measures(inner / _CAMERA)
-    camera = dict(zip(names, mm * [1.0, -1.0] + 0.0, strict=True))
-    found = []
-    for path in sorted(inner.glob("MeasuresIm-*.xml")):
-        image, marks, xy = _measures(path)
-        if missing := [name for name in marks if name not in camera]:
-            raise FormatError(f"has the mark {missing[0]}, which {_CAMERA} lacks", where=path)
-        found.append(FilmMarks(image, marks, xy, np.array([camera[n] for n in marks]).reshape(-1, 2)))
-    return found
-
-
-def _measures(path: Path) -> tuple[str, tuple[str, ...], Array]:
-    """Name of the image, names and coordinates (n, 2) of a file of MicMac."""
-    text = read_text(path)
-    if "<!ENTITY" in text or "<!DOCTYPE" in text:
-        raise FormatError("contains declarations that files of MicMac do not have", where=path)
-    try:
-        root = ET.fromstring(text)
-        one = root if root.tag == "MesureAppuiFlottant1Im" else root.find("MesureAppuiFlottant1Im")
-        if one is None:
-            raise ValueError("no MesureAppuiFlottant1Im")
-        image = (one.findtext("NameIm") or "").strip()
-        names, places = [], []
-        for point in one.findall("OneMesureAF1I"):
-            names.append((point.findtext("NamePt") or "").strip())
-            x, y = (float(word) for word in (point.findtext("PtIm") or "").split())
-            places.append((x, y))
-    except (ET.ParseError, ValueError) as error:
-        raise FormatError(f"is not a file of measured marks of MicMac ({error})", where=path) from None
-    return image, tuple(names), np.array(places, dtype=np.float64).reshape(-1, 2)
 
 
 _SCRIPT = '''\

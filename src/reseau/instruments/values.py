@@ -146,8 +146,7 @@ class Waveform:
     @property
     def seconds(self) -> Array:
         """Times of the samples relative to the trigger (n,), in seconds."""
-        times: Array = self.start_s + self.step_s * np.arange(len(self.volts), dtype=np.float64)
-        return times
+        return self.start_s + self.step_s * np.arange(len(self.volts), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -114,8 +114,7 @@ def _lost(pixels: NDArray[Any], run: int) -> Mask:
         cv2.morphologyEx(extreme, cv2.MORPH_OPEN, np.ones(size, np.uint8)) > 0
         for size in ((1, run), (run, 1))
     )
-    mask: Mask = rows | columns
-    return mask
+    return rows | columns
 
 
 def _noise(pixels: NDArray[Any], valid: Mask | None) -> float:

@@ -193,8 +193,7 @@ class Arcs:
 
 
 def _exponential(exponent: Array) -> Array:
-    bounded: Array = np.exp(np.clip(exponent, -_MOST_EXPONENT, _MOST_EXPONENT))
-    return bounded
+    return np.exp(np.clip(exponent, -_MOST_EXPONENT, _MOST_EXPONENT))
 
 
 @compiled

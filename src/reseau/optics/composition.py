@@ -86,8 +86,7 @@ class Similarity(PlaneMapping):
         return np.array([[a, -b * sign], [b, a * sign]])
 
     def _value(self, xy: Array) -> Array:
-        value: Array = xy @ self._matrix().T + self.values[:2]
-        return value
+        return xy @ self._matrix().T + self.values[:2]
 
     def derivatives(self, xy: ArrayLike) -> Derivatives:
         """See :meth:`PlaneMapping.derivatives`."""

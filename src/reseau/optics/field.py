@@ -248,8 +248,7 @@ def monomials(x: Array, y: Array, degree: int) -> Array:
 def _correlation(z: Array) -> Array:
     """Matérn correlation of smoothness 5/2 at distances in correlation lengths."""
     z = np.sqrt(5) * z
-    value: Array = (1 + z + z * z / 3) * np.exp(-z)
-    return value
+    return (1 + z + z * z / 3) * np.exp(-z)
 
 
 def _spectrum(free: Array, correlation: Array, relative: Array) -> tuple[Array, Array]:

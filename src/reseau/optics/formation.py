@@ -366,8 +366,7 @@ def coverage(
     width = np.asarray(sigma, dtype=outline.xy.dtype)[..., None, None]
     h_x = response.orders(columns, outline.xy[..., 0], width, 0)[0]
     h_y = response.orders(rows, outline.xy[..., 1], width, 0, integral=False)[0]
-    share: Array = np.swapaxes(h_y * -outline.dxy[..., :, 1:], -1, -2) @ h_x
-    return share
+    return np.swapaxes(h_y * -outline.dxy[..., :, 1:], -1, -2) @ h_x
 
 
 def coverage_derivatives(

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping as Named
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -199,8 +199,7 @@ class PlaneMapping(ABC):
         return np.array([values.get(name, old) for name, old in zip(self.names, self.values, strict=True)])
 
     def _replaced(self, values: Array) -> Self:
-        changed: Any = replace(self, values=values)  # type: ignore[type-var]
-        return changed  # type: ignore[no-any-return]
+        return replace(self, values=values)  # type: ignore[type-var]
 
     def _value(self, xy: Array) -> Array:
         return self._slope(xy)[0]

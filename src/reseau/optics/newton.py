@@ -30,8 +30,7 @@ def solve_2x2(matrix: Array, right: Array) -> Array:
 
 def determinant(matrix: Array) -> Array:
     """Determinants of (n, 2, 2) matrices."""
-    det: Array = matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] * matrix[:, 1, 0]
-    return det
+    return matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] * matrix[:, 1, 0]
 
 
 def in_blocks(function: Callable[[Array], Array], xy: Array) -> Array:

@@ -153,8 +153,7 @@ class RationalPolynomial(PlaneMapping):
 
     @cached_property
     def _coefficients(self) -> Array:
-        coefficients: Array = self._tables.fixed + np.tensordot(self.values, self._tables.by_parameter, 1)
-        return coefficients
+        return self._tables.fixed + np.tensordot(self.values, self._tables.by_parameter, 1)
 
     @cached_property
     def _polynomial_only(self) -> bool:

@@ -65,8 +65,7 @@ def rotation_matrix(r: ArrayLike) -> Array:
     theta = np.linalg.norm(vectors, axis=-1)[..., None, None]
     a, b, _ = _coefficients(theta)
     k = cross_matrix(vectors)
-    matrix: Array = np.eye(3) + a * k + b * (k @ k)
-    return matrix
+    return np.eye(3) + a * k + b * (k @ k)
 
 
 def rotate(r: ArrayLike, vectors: ArrayLike) -> tuple[Array, Array]:
@@ -127,8 +126,7 @@ def matrix_to_vector(matrix: ArrayLike) -> Array:
     sine = np.linalg.norm(v, axis=1, keepdims=True)
     # θ/sin(θ/2), which is 2 at θ = 0; arctan2 keeps it exact up to π.
     factor = np.where(sine > 1e-9, 2 * np.arctan2(sine, w) / np.where(sine > 0, sine, 1.0), 2.0)
-    vectors: Array = (factor * v).reshape(matrices.shape[:-1])
-    return vectors
+    return (factor * v).reshape(matrices.shape[:-1])
 
 
 def _quaternions(matrix: Array) -> Array:

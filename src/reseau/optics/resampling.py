@@ -104,5 +104,4 @@ def _tile(pixels: NDArray[Any], x: Array, y: Array) -> NDArray[Any]:
     if pixels.dtype.kind in "ui":
         limits = np.iinfo(pixels.dtype)
         grey = np.clip(np.rint(grey), limits.min, limits.max)
-    tile: NDArray[Any] = np.where(seen, grey, 0).astype(pixels.dtype)
-    return tile
+    return np.where(seen, grey, 0).astype(pixels.dtype)

@@ -146,8 +146,7 @@ class Sensor:
         """
         light = self._light(irradiance)
         shot = light / self.gain if self.shot_noise else np.zeros_like(light)
-        variance: Array = shot + self.read_noise**2 + (1 / 12 if self.quantise else 0.0)
-        return variance
+        return shot + self.read_noise**2 + (1 / 12 if self.quantise else 0.0)
 
     def row_shifts(self, rng: np.random.Generator) -> Array:
         """Shifts of the rows along x in pixels, (height,), for the formation of the image to be exposed."""

@@ -407,8 +407,7 @@ def _words(view: _View, outline: Array, size: tuple[int, int]) -> str:
 def _directions(xyz: Array, pose: Pose) -> Array:
     """Ideal directions (p, 2); NaN behind the camera."""
     x = pose(xyz)
-    uv: Array = x[:, :2] / np.where(x[:, 2:] > 0, x[:, 2:], np.nan)
-    return uv
+    return x[:, :2] / np.where(x[:, 2:] > 0, x[:, 2:], np.nan)
 
 
 def _gained(seen: Array, inside: Mask, lens: CameraMapping, empty: Mask) -> float:

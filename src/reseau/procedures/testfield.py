@@ -312,8 +312,7 @@ def _directions(network: Network, pose: Pose) -> Array:
     """Ideal directions (p, 2) of all points in another image with the windows of the first; NaN behind it."""
     x = (network.xyz - pose.x0) @ pose.matrix.T
     if network.parallel[0]:
-        along: Array = x[:, :2]
-        return along
+        return x[:, :2]
     uv: Array = x[:, :2] / np.where(x[:, 2:] > 0, x[:, 2:], np.nan)
     bent, every = network.refraction, np.arange(len(uv))
     if bent is None or bent.path_of[0] < 0:

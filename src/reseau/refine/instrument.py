@@ -290,8 +290,7 @@ def _joint_covariance(
     q_b = enlarged**2 * fit.cofactor
 
     def responses(conditions: Array) -> Array:
-        found: Array = -fit.cofactor @ (by_b.swapaxes(1, 2) @ weights @ by_refined @ conditions)
-        return found
+        return -fit.cofactor @ (by_b.swapaxes(1, 2) @ weights @ by_refined @ conditions)
 
     def response(conditions: Array) -> Array:
         return np.asarray(responses(conditions).sum(axis=0))

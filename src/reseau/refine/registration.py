@@ -119,8 +119,7 @@ class Registration:
         """Derivatives (n, 2, 4) of pixels of PHOTO I by the parameters of a similarity."""
         local = (xy - self.centre) / self.length
         by_local = RationalPolynomial.similarity().derivatives(local).d_parameters
-        found: Array = self.length * by_local
-        return found
+        return self.length * by_local
 
     def moves(self, xy: Array) -> Array | None:
         """Derivatives (n, 2, u) of pixels of PHOTO I by the coefficients of the camera; None where unknown.
@@ -130,8 +129,7 @@ class Registration:
         """
         if self.by_camera is None or not self.similar:
             return None
-        found: Array = self.by_parameters(xy) @ self.by_camera
-        return found
+        return self.by_parameters(xy) @ self.by_camera
 
 
 def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection) -> Registration | Failure:

@@ -83,8 +83,7 @@ class _Spline:
     def lines(self, d: Array) -> Array:
         """Values (n, size) at distances."""
         inside = (d >= self.knots[0]) & (d <= self.knots[-1])
-        found: Array = np.where(inside[:, None], self._lines(np.clip(d, self.knots[0], self.knots[-1])), 0.0)
-        return found
+        return np.where(inside[:, None], self._lines(np.clip(d, self.knots[0], self.knots[-1])), 0.0)
 
     def integrals(self, d: Array) -> Array:
         """Integrals (n, size) from the first knot."""
@@ -116,8 +115,7 @@ class _Averaged(NamedTuple):
     @property
     def share(self) -> Array:
         """Shares (n,) of the solutions in the covariance of the mean; their sum is 1."""
-        share: Array = self.weight * (2 * np.cumsum(self.weight) - self.weight)
-        return share
+        return self.weight * (2 * np.cumsum(self.weight) - self.weight)
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,20 +268,6 @@ class FreeCurve:
         light = self.spline.lines(distance) @ a[:-1] + a[-1] * _tail_slope(distance, self.width)
         return (step * gaussian + light) / whole, gaussian
 
-    @property
-    def tail(self) -> tuple[float, float]:
-        """Share of the light in the tail beyond the outermost pixels of the region, and its sigma."""
-        each, k = self._averaged, self.spline.knots
-        areas = np.append(self.spline.transforms(np.zeros(1)).real[0], 1.0)
-        outside = 1 - float(_tail_spread(k[-1:], self.width)[0] - _tail_spread(k[:1], self.width)[0])
-        whole = self._step[0] + each.values @ areas
-        share = outside * each.values[:, -1] / whole
-        by = -share[:, None] * areas / whole[:, None]
-        by[:, -1] += outside / whole
-        mean = float(each.weight @ share)
-        own = np.einsum("ni,nij,nj->n", by, each.cov, by)
-        return mean, float(np.sqrt(each.share @ own + each.weight @ (share - mean) ** 2))
-
     def ends(self) -> tuple[float, float]:
         """Share of the step that rises in the outer quarters of the region beside the tail, and the
         probability that noise alone causes the coefficients there. A significant rise means blur beyond the
@@ -385,14 +369,12 @@ def _tail_width(base: Array) -> float:
 
 def _tail_spread(d: Array, width: float) -> Array:
     """Integral of :func:`_tail_slope`, from the dark side."""
-    spread: Array = 0.5 + np.arctan(d / width) / np.pi
-    return spread
+    return 0.5 + np.arctan(d / width) / np.pi
 
 
 def _tail_slope(d: Array, width: float) -> Array:
     """A Lorentzian of the area 1."""
-    slope: Array = width / (np.pi * (d**2 + width**2))
-    return slope
+    return width / (np.pi * (d**2 + width**2))
 
 
 def _side(reach: float, core: float, step: float) -> Array:

@@ -65,13 +65,11 @@ class EdgePixels:
     def distance(self, offset: float, slope: float, bow: float = 0.0) -> Array:
         """Distances from the edge along its normal."""
         turned = slope + 2 * bow * self.y / self.half**2
-        distance: Array = self.aside(offset, slope, bow) / np.hypot(1.0, turned)
-        return distance
+        return self.aside(offset, slope, bow) / np.hypot(1.0, turned)
 
     def aside(self, offset: float, slope: float, bow: float) -> Array:
         """Distances from the edge along the row."""
-        aside: Array = self.x - offset - slope * self.y - bow * self.bent
-        return aside
+        return self.x - offset - slope * self.y - bow * self.bent
 
     @property
     def bent(self) -> Array:
@@ -85,8 +83,7 @@ class EdgePixels:
 
     def bent_at(self, y: Array) -> Array:
         """Displacement of the edge by a bow of 1, along the rows."""
-        bent: Array = (y**2 - (self.size[0] ** 2 - 1) / 12) / self.half**2
-        return bent
+        return (y**2 - (self.size[0] ** 2 - 1) / 12) / self.half**2
 
     def turning(self, offset: float, slope: float, bow: float) -> tuple[Array, Array]:
         """Derivatives of the distance with respect to slope and bow."""
@@ -216,15 +213,13 @@ def _folded(integral: _Integral, d: Array, sigma: float, c: float, s: float) -> 
     d, s = _close(d, sigma), max(s, 1e-3)  # along the rows the trapezoid degenerates to a square
     wide, narrow = (c + s) / 2, (c - s) / 2
     ends = integral(d + wide, sigma) - integral(d + narrow, sigma) - integral(d - narrow, sigma)
-    folded: Array = (ends + integral(d - wide, sigma)) / (c * s)
-    return folded
+    return (ends + integral(d - wide, sigma)) / (c * s)
 
 
 def _close(d: Array, sigma: float) -> Array:
     """Distances clipped to where the function is constant; beyond, differences of squares lose precision."""
     reach = 9 * sigma + 1.5
-    close: Array = np.clip(d, -reach, reach)
-    return close
+    return np.clip(d, -reach, reach)
 
 
 def _never(u: Array, sigma: float) -> Array:

@@ -404,8 +404,7 @@ def _signals(limits: Limits, up: Array, down: Array, score: Array) -> Rows:
     """1, −1 or 0 for each chart."""
     w = np.nan_to_num(score)
     rise, fall = (up > limits.limit) | (w > limits.single), (down > limits.limit) | (w < -limits.single)
-    found: Rows = np.where(rise, 1, np.where(fall, -1, 0)).astype(np.intp)
-    return found
+    return np.where(rise, 1, np.where(fall, -1, 0)).astype(np.intp)
 
 
 class _KnownPredictor:
@@ -531,8 +530,7 @@ def _solve(matrix: Array, right: Array) -> Array:
     """Solve small systems; a division for one unknown."""
     if matrix.shape[-1] == 1:
         return right / np.where(matrix == 0, 1.0, matrix)
-    found: Array = np.linalg.pinv(matrix, hermitian=True) @ right
-    return found
+    return np.linalg.pinv(matrix, hermitian=True) @ right
 
 
 def _median(values: Array) -> Array:
@@ -540,11 +538,9 @@ def _median(values: Array) -> Array:
     ordered = np.sort(values, axis=-1)  # NaN last
     count = np.isfinite(values).sum(axis=-1, keepdims=True)
     ends = [np.take_along_axis(ordered, np.maximum(k, 0), axis=-1) for k in ((count - 1) // 2, count // 2)]
-    found: Array = np.where(count > 0, (ends[0] + ends[1]) / 2, 0.0)
-    return found
+    return np.where(count > 0, (ends[0] + ends[1]) / 2, 0.0)
 
 
 def _visible(phi: Array, true: Array) -> Array:
     """Effect of a shift of one standard deviation on scores that use φ, when the true one is `true`."""
-    found: Array = (1.0 - phi) / np.sqrt(1.0 - 2.0 * phi * true + phi * phi)
-    return found
+    return (1.0 - phi) / np.sqrt(1.0 - 2.0 * phi * true + phi * phi)

@@ -542,8 +542,7 @@ def _p_value(y: Array, larger: Array, smaller: Array) -> float:
 def _within(calibration: Calibration, names: tuple[str, ...]) -> Array:
     """Covariance of the named parameters."""
     rows = [calibration.covariance.names.index(name) for name in names]
-    found: Array = np.array(calibration.covariance.matrix)[np.ix_(rows, rows)]
-    return found
+    return np.array(calibration.covariance.matrix)[np.ix_(rows, rows)]
 
 
 def _scatter(residuals: Array, terms: int, within: Sequence[Array]) -> Array:

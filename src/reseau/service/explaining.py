@@ -102,10 +102,7 @@ class RunHistory:
         """Sizes (2, r) of a change of rms `limit`: equal in all coordinates of the field, or as of errors."""
         r = self.values.shape[1]
         rms = np.sqrt(np.square(self.basis).sum(axis=(0, 1)) / len(self.basis))
-        found: Array = limit * np.array(
-            [1 / (rms * np.sqrt(r)), np.full(r, 1 / np.sqrt(np.square(rms).sum()))]
-        )
-        return found
+        return limit * np.array([1 / (rms * np.sqrt(r)), np.full(r, 1 / np.sqrt(np.square(rms).sum()))])
 
     def own_errors(self, rows: Array, base: Array, limit: float) -> Array:
         """Log likelihoods of some runs by an error of each of them, for each scale of the other errors."""

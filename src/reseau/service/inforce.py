@@ -102,21 +102,6 @@ class Configurations:
         """
         return dict(self._entries(name)[0].document["parts"])
 
-    def find(self, parts: Mapping[str, str]) -> str:
-        """Return the configuration whose parts are all among the given ones.
-
-        Raises
-        ------
-        UsageError
-            If there is none, or several.
-        """
-        given = {key: str(value) for key, value in parts.items()}
-        found = [name for name in self.names() if self.parts(name).items() <= given.items()]
-        if len(found) != 1:
-            said = "no configuration has" if not found else f"{', '.join(found)} have"
-            raise UsageError(f"{said} these parts", where=", ".join(f"{k}={v}" for k, v in given.items()))
-        return found[0]
-
     def decide(
         self,
         name: str,

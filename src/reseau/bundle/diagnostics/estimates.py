@@ -472,8 +472,7 @@ class PointEstimates(Display):
 
 def _deviations(cov: Array) -> Array:
     """Return the standard deviations (…, k) of covariances (…, k, k)."""
-    deviations: Array = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
-    return deviations
+    return np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
 
 
 def _median(sigma: Array, unit: str) -> str:

@@ -170,5 +170,4 @@ def _with_mean_pose(result: Result, c: int, columns: Rows) -> Array:
     poses[:3, :, :3] = np.eye(3)[:, None, :] / m
     poses[3:, :, 3:] = -np.swapaxes(rotation[images], 0, 1) / m
     cofactor = turn @ result.fit.cofactors.reduced.block(at, at) @ turn.T
-    covariance: Array = cofactor * result.fit.variance
-    return covariance
+    return cofactor * result.fit.variance

@@ -141,8 +141,7 @@ def by_point(result: Result, kinds: Sequence[str | None]) -> Rows:
     names = {kind: k for k, kind in enumerate(dict.fromkeys(kind for kind in kinds if kind is not None))}
     kind_of = np.array([-1 if kind is None else names[kind] for kind in kinds], dtype=np.intp)
     of = kind_of[network.image_of]
-    key: Rows = np.where(of >= 0, of * len(network.points) + network.point_of, -1)
-    return key
+    return np.where(of >= 0, of * len(network.points) + network.point_of, -1)
 
 
 def by_place(result: Result, camera: int, across: int = 12, down: int | None = None) -> Rows:
@@ -174,8 +173,7 @@ def by_place(result: Result, camera: int, across: int = 12, down: int | None = N
     size = np.array([entry.width, entry.height])
     cell = np.clip(np.floor((network.xy + 0.5) / size * [across, down]), 0, [across - 1, down - 1])
     own = network.camera_of[network.image_of] == camera
-    key: Rows = np.where(own, cell[:, 1] * across + cell[:, 0], -1).astype(np.intp)
-    return key
+    return np.where(own, cell[:, 1] * across + cell[:, 0], -1).astype(np.intp)
 
 
 @one_thread()

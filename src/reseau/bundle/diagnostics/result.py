@@ -526,8 +526,7 @@ class Result(Estimated, Display):
     def formal_camera_covariance(self, c: int) -> Array:
         """Return the covariance that presumes independent errors of all image points."""
         _, columns, _ = self.camera_columns(c)
-        covariance: Array = self.fit.cofactors.reduced.block(columns, columns) * self.fit.variance
-        return covariance
+        return self.fit.cofactors.reduced.block(columns, columns) * self.fit.variance
 
     def camera_tests(self, c: int, alpha: float = 0.05) -> tuple[CoefficientTest, ...]:
         """Test each distortion and additional parameter of a camera against zero."""
@@ -648,8 +647,7 @@ class Result(Estimated, Display):
                 raise UsageError("is not an estimated unknown", where=name)
         joint = self.fit.cofactors.joint(np.array(columns, dtype=np.intp), np.array(points, dtype=np.intp))
         at = [len(columns) + 3 * k + axis if of_point else k for of_point, k, axis in places]
-        covariance: Array = joint[np.ix_(at, at)] * self.fit.variance
-        return covariance
+        return joint[np.ix_(at, at)] * self.fit.variance
 
     # -- observations
 

@@ -87,8 +87,7 @@ class Arrow:
         tail = scipy.linalg.cho_solve((self.corner, True), tail, check_finite=False)
         if b:
             head = _backward(self.band, head - self.coupling @ tail)
-        solved: Array = (np.concatenate([head, tail]).T * self.scale).T
-        return solved
+        return (np.concatenate([head, tail]).T * self.scale).T
 
     def inverse(self) -> tuple[Array, Array]:
         """Compute the entries of the inverse inside the band (b, w + 1), and its full rows (r, u).

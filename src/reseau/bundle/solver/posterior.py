@@ -340,8 +340,7 @@ class Cofactors:
             one = g @ r.weight @ h.T
             joint = joint - one - one.T + g @ r.m @ g.T
         free = np.concatenate([np.ones(k), system.movable[points].ravel()])
-        covariance: Array = joint * np.outer(free, free)
-        return covariance
+        return joint * np.outer(free, free)
 
 
 def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_part: Mask) -> Cofactors:

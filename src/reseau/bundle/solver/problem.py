@@ -131,8 +131,7 @@ class BundleProblem(Display):
     def centre(self) -> Array:
         """Centroid of the points (3,), the origin of reduced coordinates: large ones keep their precision."""
         known = self.start.xyz[finite(self.start.xyz)]
-        centre: Array = known.mean(axis=0) if len(known) else np.zeros(3)
-        return centre
+        return known.mean(axis=0) if len(known) else np.zeros(3)
 
     @cached_property
     def others(self) -> OtherObservations:

@@ -115,8 +115,7 @@ class System:
         return _mappings(self.unknowns.network, self.seen.camera, values)
 
     def _weighted(self, rows: Rows, matrix: Array) -> Array:
-        weighted: Array = self.seen.root[rows] @ matrix
-        return weighted
+        return self.seen.root[rows] @ matrix
 
     def derivatives(self, values: Values) -> tuple[Array, Array, Array]:
         """Compute weighted derivatives (n, 2, w) and misfits at given values, as those of :meth:`misfits`."""

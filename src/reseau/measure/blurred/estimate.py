@@ -57,8 +57,7 @@ class EstimatedOptics:
     @property
     def sigma(self) -> Array:
         """Standard deviations (p,)."""
-        sigma: Array = np.sqrt(np.diagonal(self.cov))
-        return sigma
+        return np.sqrt(np.diagonal(self.cov))
 
 
 def estimate_optics(

@@ -107,5 +107,4 @@ def medians(values: Array, used: Mask) -> Array:
     ordered = np.sort(np.where(used, values, np.inf), axis=1)  # values not in use are sorted to the end
     count, each = used.sum(axis=1), np.arange(len(values))
     middle = 0.5 * (ordered[each, np.maximum(count - 1, 0) // 2] + ordered[each, count // 2])
-    median: Array = np.where(count > 0, middle, 0.0)[:, None]
-    return median
+    return np.where(count > 0, middle, 0.0)[:, None]

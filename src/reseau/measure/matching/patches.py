@@ -289,8 +289,7 @@ class Patches:
 
     def width(self, x: Array, at: Rows) -> Array:
         """Width of the point-spread function (m,) from its logarithm, with a lower bound."""
-        width: Array = np.hypot(SHARPEST * self.psf[at], np.exp(x[:, WIDTH]))
-        return width
+        return np.hypot(SHARPEST * self.psf[at], np.exp(x[:, WIDTH]))
 
     def change(self, before: Array, x: Array, at: Rows) -> Array:
         """Relative change (m,) of the images of the marks `at` from `before` to `x` (m, u)."""

@@ -480,8 +480,7 @@ class _Judge:
     def _likeness(self, found: ArcMatches) -> Array:
         """Correlations with the formed arcs (m,), corrected for noise."""
         white = np.clip((self.screened.noise / np.maximum(found.noise, 1e-12)) ** 2, 0, 1)
-        likeness: Array = np.sqrt(1 - (1 - np.clip(found.correlation, 0, 1) ** 2) * (1 - white))
-        return likeness
+        return np.sqrt(1 - (1 - np.clip(found.correlation, 0, 1) ** 2) * (1 - white))
 
     def _looks_drawn(self, at: Rows, found: ArcMatches) -> Mask:
         suspect = np.zeros(len(self.echoes), dtype=bool)

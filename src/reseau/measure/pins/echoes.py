@@ -253,8 +253,7 @@ def _claimed(owner: NDArray[np.int32]) -> NDArray[np.int32]:
     if not (owner >= 0).any():
         return owner
     distance, (row, column) = scipy.ndimage.distance_transform_edt(owner < 0, return_indices=True)
-    claimed: NDArray[np.int32] = np.where(distance <= _CLAIM_PX, owner[row, column], -1).astype(np.int32)
-    return claimed
+    return np.where(distance <= _CLAIM_PX, owner[row, column], -1).astype(np.int32)
 
 
 def _edges(light: Grey, owner: NDArray[np.int32], count: int) -> Array:

@@ -31,14 +31,12 @@ _FEWEST = 4
 def is_sharp(echoes: Echoes) -> Mask:
     """Mask (m,) of spots with sharp borders all around."""
     short = echoes.length < 8.0
-    sharp: Mask = (echoes.edge[:, 1] > _SHARP) | (short & (echoes.edge[:, 0] > _ACROSS))
-    return sharp
+    return (echoes.edge[:, 1] > _SHARP) | (short & (echoes.edge[:, 0] > _ACROSS))
 
 
 def looks_drawn(echoes: Echoes) -> Mask:
     """Mask (m,) of spots about as sharp along as across: drawn, if they stand in a row of such spots."""
-    suspect: Mask = echoes.edge[:, 1] > _SUSPECT
-    return suspect
+    return echoes.edge[:, 1] > _SUSPECT
 
 
 def series(echoes: Echoes, suspect: Mask) -> tuple[Mask, Mask]:

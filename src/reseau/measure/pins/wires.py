@@ -58,11 +58,6 @@ class Wires:
     start: Array
     end: Array
 
-    @classmethod
-    def of_points(cls, ids: tuple[str, ...], xy: Array) -> Wires:
-        """Wires that are all normal to the plane, from their names and positions (n, 2)."""
-        return cls(ids, xy, xy)
-
     @property
     def fixed(self) -> Mask:
         """Mask (n,) of the wires normal to the plane."""

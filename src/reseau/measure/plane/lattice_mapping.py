@@ -112,8 +112,7 @@ def second_order(mapping: Chain, at: Array) -> tuple[Array, Array, Array]:
 def straightened(mapping: Chain, xy: Array) -> Array:
     """Lattice coordinates (n, 2) of image points by the projectivity alone."""
     back = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(matrix_of(mapping)).T
-    at: Array = np.ascontiguousarray(back[:, :2] / back[:, 2:])
-    return at
+    return np.ascontiguousarray(back[:, :2] / back[:, 2:])
 
 
 def reduced(mapping: Chain, factor: float, shift: Array) -> Chain:

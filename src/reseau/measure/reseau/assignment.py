@@ -61,8 +61,7 @@ class Assignment:
             Strengths of all candidates, in descending order.
         """
         has = self.candidate >= 0
-        likeness: Array = np.minimum(t[self.candidate[has]] / _usual(t, len(self.candidate)), 1.0)
-        return likeness
+        return np.minimum(t[self.candidate[has]] / _usual(t, len(self.candidate)), 1.0)
 
     def support(self, t: Array) -> float:
         """The score with every mark weighted with its likeness."""

@@ -273,8 +273,7 @@ def _starts(plane: Array, voters: Candidates, most: float, count: int) -> Iterat
 
 
 def _complex(xy: Array) -> NDArray[np.complex128]:
-    z: NDArray[np.complex128] = xy[:, 0] + 1j * xy[:, 1]
-    return z
+    return xy[:, 0] + 1j * xy[:, 1]
 
 
 def _similarities(plane: Array, candidates: Candidates, most: float, count: int) -> list[complex]:

@@ -363,8 +363,7 @@ class MarkMeasurement:
 
     def _axes(self, at: Rows) -> Array:
         """Linear mappings (m, 2, 2) from an upright mark to the images of the marks `at`."""
-        axes: Array = self.field.jacobian(self.source[at]) @ self.arms[at]
-        return axes
+        return self.field.jacobian(self.source[at]) @ self.arms[at]
 
     def _match(
         self,
@@ -637,8 +636,7 @@ def _of_each(options: MatchOptions, rows: Rows) -> dict[str, Any]:
 
 def _sure(found: Matches) -> Mask:
     """Mask of reliable matches."""
-    sure: Mask = found.converged & (found.t > 8) & (found.seen > 0.9) & (found.rejected < 0.2)
-    return sure
+    return found.converged & (found.t > 8) & (found.seen > 0.9) & (found.rejected < 0.2)
 
 
 def _robust(values: Array, least: float) -> tuple[float, float]:

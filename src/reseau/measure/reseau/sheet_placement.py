@@ -273,8 +273,7 @@ def _sectors(sectors: tuple[tuple[float, float], ...], turn: Array) -> Array:
     x, y = turn.T @ np.stack([np.cos(angle), np.sin(angle)])
     degrees = np.rad2deg(np.arctan2(y, x))
     inside = [np.mod(degrees - start, 360) < end - start for start, end in sectors]
-    expected: Array = np.any(inside, axis=0).astype(np.float64) if inside else np.zeros(_ANGLES)
-    return expected
+    return np.any(inside, axis=0).astype(np.float64) if inside else np.zeros(_ANGLES)
 
 
 def _agreement(dark: Array, expected: Array) -> Array:

@@ -323,8 +323,7 @@ class _Measurement:
         way = at - self.middle
         parts = np.array([0.4, 0.7, 1.0])[:, None, None]
         slope = slope_of(self.scene.mapping, (self.middle + parts * way).reshape(-1, 2))
-        unfolded: Mask = np.asarray((np.linalg.det(slope).reshape(3, -1) < 0).all(axis=0))
-        return unfolded
+        return np.asarray((np.linalg.det(slope).reshape(3, -1) < 0).all(axis=0))
 
     def columns(self) -> dict[str, Any]:
         """Columns of the result from `xy` to `noise`."""

@@ -81,14 +81,12 @@ class BrownDistortion(Radial):
     @cached_property
     def radial(self) -> Array:
         """K1, K2, K3, and with higher terms K4, K5."""
-        radial: Array = np.concatenate([self.values[:3], self.values[7:]])
-        return radial
+        return np.concatenate([self.values[:3], self.values[7:]])
 
     @cached_property
     def balance(self) -> Array:
         """R0², R0⁴, R0⁶ …, one for each radial term."""
-        balance: Array = self.balance_radius_mm ** np.array([2.0, 4.0, 6.0, 8.0, 10.0])[: len(self.radial)]
-        return balance
+        return self.balance_radius_mm ** np.array([2.0, 4.0, 6.0, 8.0, 10.0])[: len(self.radial)]
 
     @cached_property
     def fold(self) -> float:
@@ -231,8 +229,7 @@ class Brown(PlaneMapping):
         photo = xy if self.grid is None else self.grid.to_photo(xy)
         if self.values[0] == 0:
             return np.full(xy.shape, np.nan)
-        directions: Array = self._lens.inverse(photo - self.values[1:3]) / self._ideal
-        return directions
+        return self._lens.inverse(photo - self.values[1:3]) / self._ideal
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,8 +113,7 @@ class Converted(Display):
         if unknown:
             raise UsageError(f"is not one of {', '.join(self.original)}", where=unknown[0])
         by = self.by_original[:, [self.original.index(name) for name in names]]
-        found: Array = by @ np.asarray(covariance, dtype=np.float64) @ by.T
-        return found
+        return by @ np.asarray(covariance, dtype=np.float64) @ by.T
 
 
 def convert(

@@ -55,10 +55,8 @@ class PixelGrid:
 
     def to_photo(self, pixels: ArrayLike) -> Array:
         """Photo-coordinates (n, 2) in mm of pixels (n, 2)."""
-        photo: Array = (as_points(pixels) - self.centre) / self.pixels_per_mm
-        return photo
+        return (as_points(pixels) - self.centre) / self.pixels_per_mm
 
     def to_pixels(self, photo: ArrayLike) -> Array:
         """Pixels (n, 2) of photo-coordinates (n, 2) in mm."""
-        pixels: Array = as_points(photo) * self.pixels_per_mm + self.centre
-        return pixels
+        return as_points(photo) * self.pixels_per_mm + self.centre

@@ -90,8 +90,7 @@ class OpenPtv(PlaneMapping):
         if self.values[0] == 0:
             return np.full(xy.shape, np.nan)
         photo = self.grid.to_photo(xy) @ np.linalg.inv(self._affine).T
-        directions: Array = (self._lens.inverse(photo) - self.values[1:3]) / self._ideal
-        return directions
+        return (self._lens.inverse(photo) - self.values[1:3]) / self._ideal
 
 
 def _build(values: Array, grid: PixelGrid, options: Mapping[str, Any]) -> OpenPtv:

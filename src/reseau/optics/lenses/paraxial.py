@@ -165,13 +165,6 @@ class Paraxial:
         y, u = (float(part[-1]) for part in self.ray(object_distance, 1.0, last=self._power))
         return float(-y / u) if abs(u) > 1e-15 else np.inf
 
-    def marginal(self, object_distance: float = np.inf) -> tuple[Array, Array]:
-        """Heights and slopes at all surfaces of the ray from the axis to the edge of the stop."""
-        if np.isinf(object_distance):
-            return self.ray(self.entrance_pupil_radius, 0.0)
-        slope = self.entrance_pupil_radius / (object_distance + self.entrance_pupil[0])
-        return self.ray(object_distance * slope, slope)
-
     def principal(self, slope: float) -> tuple[Array, Array]:
         """Heights and slopes at all surfaces of the ray through the centre of the stop."""
         return self.ray(-slope * self.entrance_pupil[0], slope)

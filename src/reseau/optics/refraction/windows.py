@@ -17,7 +17,7 @@ outside the first. The radius of a sphere or cylinder is that of its inner surfa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -517,8 +517,7 @@ class Refraction(Display):
         """Which parameters (u,) are estimated: free, and passed by the rays of an image."""
         own = [name in window.free for window in self.windows for name in window.names]
         given = np.array([*own, *(medium.free for medium in self.media)], dtype=np.bool_)
-        used: Mask = given & self.used
-        return used
+        return given & self.used
 
     @cached_property
     def used(self) -> Mask:
@@ -561,22 +560,6 @@ class Refraction(Display):
         media = tuple(
             replace(medium, value=float(value))
             for medium, value in zip(self.media, given[self.starts[-1] :], strict=True)
-        )
-        return replace(self, windows=windows, media=media)
-
-    def held(self, labels: Sequence[str]) -> Self:
-        """Return the same with these parameters held at their values."""
-        windows = tuple(
-            replace(
-                window,
-                free=tuple(n for n in window.free if f"{n} of {window.name}" not in labels),
-                sigma={n: s for n, s in window.sigma.items() if f"{n} of {window.name}" not in labels},
-            )
-            for window in self.windows
-        )
-        media = tuple(
-            replace(medium, free=False, sigma=None) if medium.label in labels else medium
-            for medium in self.media
         )
         return replace(self, windows=windows, media=media)
 

@@ -196,8 +196,7 @@ def _interrupted(service: Service, link: BenchLink) -> list[str]:
             if each.status != "done" and service.archive.session(each.name).bench == link.text
         ]
 
-    found: list[str] = service.current(f"interrupted {link.name}", compute)
-    return found
+    return service.current(f"interrupted {link.name}", compute)
 
 
 def _asked(
