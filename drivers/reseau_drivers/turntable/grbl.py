@@ -103,8 +103,8 @@ class Grbl:
         self._ready(deadline)
         self._reset(deadline)
         self._alarm, self._announced = None, False
-        if self._bears_marks:
-            with suppress(RefusedError, StateError):  # one that is locked takes it only after the search
+        if self._bears_marks and self._report(deadline).state == "Idle":  # one that is locked takes none
+            with suppress(RefusedError):
                 self._exchange(order(self._known, "search"), deadline)
                 self._announced = True
         # GRBL says `ok` to $H when it has ended; a refusal comes at once, and the status shows the search.
