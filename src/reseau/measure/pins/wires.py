@@ -50,7 +50,7 @@ class Wires:
     --------
     >>> import numpy as np
     >>> grid = np.stack(np.meshgrid([0.0, 10, 20], [0.0, 10]), axis=-1).reshape(-1, 2)
-    >>> Wires.of_points(tuple("abcdef"), grid).spacing
+    >>> Wires(tuple("abcdef"), grid, grid).spacing
     10.0
     """
 
@@ -165,7 +165,7 @@ def lay_wires(
     --------
     >>> import numpy as np
     >>> points = np.array([[0.0, 0], [10, 0], [20, 0], [0, 10], [10, 10], [0, 25]])
-    >>> wires = Wires.of_points(tuple("abcdef"), points)
+    >>> wires = Wires(tuple("abcdef"), points, points)
     >>> seen = points[::-1] * [4.0, -4.0] + [50, 120]
     >>> lay_wires(wires, seen).row
     array([5, 4, 3, 2, 1, 0])
