@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from reseau.bundle import Camera, Network, Options, adjust_network, problem_of
+from reseau.bundle import Camera, Network, adjust_network, problem_of
 from reseau.bundle.modelling.board import held_as_designed
 from reseau.bundle.network.rig import Rig
 from reseau.core.data import Array, ImagePoints, Rows
@@ -1124,9 +1124,7 @@ def calibrated(case: Case, *, reject: bool = False) -> Calibrated | Failure:
     return calibrate_camera(
         list(case.measured.items()), scene.target, _unmeasured, dict.fromkeys(cameras, scene.size),
         CameraOptions(model=case.model, free=case.free),
-        CalibrationOptions(
-            Options(outliers="reject" if reject else "keep"), target="flat" if case.flat else "free"
-        ),
+        CalibrationOptions(target="flat" if case.flat else "free", reject=reject),
         scene.taken,
     )  # fmt: skip
 
