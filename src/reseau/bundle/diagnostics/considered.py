@@ -155,8 +155,8 @@ def considered(
         square, count = square[len(at) :, len(at) :], len(columns) + len(held)
         names = tuple(camera.names[k] for k in held)
         found = Considered(names, square, seen.carried, np.zeros((count, count)))
-    elif not rivals:
-        return None
+    if not rivals:
+        return found if held else None
     possible = found.errors(columns)
     possible[: len(columns), : len(columns)] += covariance
     some = uv[:: max(1, len(uv) // _PLACES)]

@@ -37,10 +37,8 @@ from .evidence import (
     used_rows,
 )
 from .image_effects import distance_effects, point_effects, smooth_effects
-from .views import looked_at, views_of
+from .views import LEAST, looked_at, views_of
 
-_LEAST = 3
-"""Fewer images show nothing in common."""
 _SHAPE = 0.7
 """Standard deviation of the logarithm by which fields of another form than assumed do more or less to a
 parameter: a factor of two."""
@@ -265,7 +263,7 @@ def shared_errors(fit: BundleFit) -> SharedErrors | None:
         None with fewer than three images, without redundancy, or where the network is too large.
     """
     images = looked_at(fit)
-    if len(images) < _LEAST or fit.redundancy < 1 or not fit.sigma0 > 0:
+    if len(images) < LEAST or fit.redundancy < 1 or not fit.sigma0 > 0:
         return None
     (smooth, forms), distance, points = smooth_effects(fit), distance_effects(fit), point_effects(fit)
     views = views_of(fit)

@@ -19,7 +19,7 @@ from .image_effects import smooth_effects
 
 _LENGTH, _DEGREE = "0.6", 2
 """Length of the fields that are compared, and degree of their polynomials, in which copies are alike, too."""
-_LEAST, _MOST, _TOGETHER = 3, 48, 400
+LEAST, _MOST, _TOGETHER = 3, 48, 400
 """Fewer images show nothing in common; of more, as many are looked at; beyond, each is a view of its own."""
 
 
@@ -34,7 +34,7 @@ def views_of(fit: BundleFit) -> Rows:
     """Return the number of the view of each image of a network (m,); those that are looked at come first."""
     network, images = fit.problem.network, looked_at(fit)
     every = np.arange(len(network.images), dtype=np.intp)
-    if not len(images) >= _LEAST or not len(every) <= _TOGETHER or fit.redundancy < 1:
+    if len(images) < LEAST or len(every) > _TOGETHER or fit.redundancy < 1:
         return _numbered(every, images)
     smooth, forms = smooth_effects(fit, _DEGREE)
     q, place = smooth.slope.shape[2], np.full(len(every), -1, dtype=np.intp)
@@ -47,7 +47,7 @@ def views_of(fit: BundleFit) -> Rows:
     nothing = best = alone.log_evidence()
     found, before = every, len(images)
     tree = _tree(network, used_rows(fit))
-    for count in range(len(every) - 1, _LEAST - 1, -1):
+    for count in range(len(every) - 1, LEAST - 1, -1):
         views = _cut(tree, count)
         own = np.unique(views[images], return_inverse=True)[1]
         if (several := int(own.max()) + 1) in (before, 1):

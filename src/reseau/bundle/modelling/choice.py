@@ -586,15 +586,18 @@ class _Search:
             else:
                 compared.append(self._compared(each, one, found[self.pick], 2 * (best - density[each])))
         chosen = next(each for each in compared if each.candidate == self.pick)
-        if self.before is not None:
-            known = {each.candidate for each in compared}
-            compared += [each for each in self.before.choice().compared if each.candidate not in known]
-        return ModelChoice(camera_of(fit, self.camera), tuple(compared), chosen, self._rivals(density))
+        if self.before is None:
+            rivals = self._rivals(found, density)
+        else:
+            alone, known = self.before.choice(), {each.candidate for each in compared}
+            compared += [each for each in alone.compared if each.candidate not in known]
+            rivals = alone.rivals
+        return ModelChoice(camera_of(fit, self.camera), tuple(compared), chosen, rivals)
 
-    def _rivals(self, density: Mapping[Candidate, float]) -> tuple[Rival, ...]:
+    def _rivals(
+        self, found: Mapping[Candidate, Prediction], density: Mapping[Candidate, float]
+    ) -> tuple[Rival, ...]:
         """The best candidate of each kind but that of the chosen one, with its probability."""
-        if self.before is not None:
-            return self.before.choice().rivals
         if self.pick not in density:
             return ()
         kinds = [self.pick]
@@ -602,7 +605,6 @@ class _Search:
             kinds += [each] if not any(each.alike(other) for other in kinds) else []
         alike = max(value for each, value in density.items() if each.alike(self.pick))
         total = float(scipy.special.logsumexp([alike, *(density[each] for each in kinds[1:])]))
-        found = self._predictions()
         return tuple(
             Rival(float(np.exp(density[each] - total)), self._mapping(each, found[each]))
             for each in kinds[1:]
