@@ -15,16 +15,20 @@ import scipy.special
 
 from ..core.data import Array
 
-_MORE_LIKELY = 0.5
 _LOSS = 10.0
 """What it costs to accept by mistake, by what it costs to hold back by mistake: allowed in 1 % of the years,
 and 0.1 times a year."""
+_LATE = 5.0
+"""What it costs to announce a trend late, by what it costs to announce one that is none: one stable run in 20
+may have a warning, and a quarter of these may be of trends."""
 _SCALES = np.array([1.0, 1.5, 2.2, 3.3, 5.0])
 """Scales of the errors between runs, in the standard deviations that the calibrations state."""
 _HOLD = 8.0
 """How much more probable it is that these hold than that errors are a step of the scale larger."""
 _LEAST = 0.02
 """Part of the largest error below which a direction is not one of errors: changes in it are `outside`."""
+_AHEAD = np.append(0.0, np.geomspace(1.0, 36525.0, 300))[:, None]
+"""Times at which a drift may reach its limit, days."""
 _YEAR = 365.25
 """Period of seasons, days."""
 _WIDTHS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
@@ -131,8 +135,6 @@ class History:
         Largest standard deviation of a run over the image.
     p : float
         Probability that errors alone let the last run differ so much from the one in force.
-    rate_day : float
-        Growth of the drift a day, as far as it creeps.
     """
 
     stable: float
@@ -142,10 +144,11 @@ class History:
     scale: float
     sigma: float
     p: float
-    rate_day: float
     _weights: Array
     _total: Array
     _step: Array
+    _growth: Array
+    """Growth of the drift a day by each model, in parts of the drift."""
 
     def beyond(self, limit: float, *, step: bool = False) -> float:
         """Return the probability that the drift, or the step from the run in force, exceeds a limit."""
@@ -164,8 +167,27 @@ class History:
         return _LOSS * above > below
 
     def creeps(self, size: float) -> bool:
-        """Return whether the instrument has drifted by a size, and rather little by little than at once."""
-        return self.creeping + self.seasonal > self.changed and self.beyond(size) > _MORE_LIKELY
+        """Return whether a trend should be announced: that the drift has reached a size little by little.
+
+        It should where to say it late would be dearer than to say it in vain, and a change at once is less
+        probable.
+        """
+        there = self.beyond(size)
+        return self.creeping + self.seasonal > self.changed and _LATE * there > 1 - there
+
+    @property
+    def rate_day(self) -> float:
+        """Growth of the drift a day, if it creeps."""
+        return float(self._weights @ (self._total[0] * self._growth)) / max(self.creeping, 1e-300)
+
+    def reaches(self, limit: float, *quantiles: float) -> Array:
+        """Return in how many days the drift reaches a limit, if it creeps: quantiles of that time."""
+        creeps = self._growth > 0
+        (size, sigma), weights = self._total[:, creeps], self._weights[creeps] / max(self.creeping, 1e-300)
+        grown = 1 + _AHEAD * self._growth[creeps]
+        reached = scipy.special.ndtr((size - limit / grown) / np.maximum(sigma, 1e-300)) @ weights
+        found: Array = np.interp(quantiles, reached, _AHEAD[:, 0])
+        return found
 
     def size(self, *, step: bool = False) -> tuple[float, float]:
         """Return the drift since the reference (or the step) and its standard deviation."""
@@ -210,15 +232,13 @@ def explain_runs(runs: RunHistory, limit: float, in_force: int) -> History:
     scale = float(weights @ np.concatenate([each.scale for each in found])) if n > 2 else 1.0
     off = runs.values[-1] - runs.values[in_force]
     statistic = off @ np.linalg.solve(runs.covs[-1] + runs.covs[in_force], off) / scale**2
-    rates = np.concatenate([each.rate for each in found])
-    rate = float((weights * rates)[kinds == 1].sum()) / max(creeps, 1e-300)
     sigma = scale * float(np.linalg.svd(runs.basis, compute_uv=False)[:, 0].max())
     total, step = (
         np.concatenate(each, axis=1) for each in zip(*((f.total, f.step) for f in found), strict=True)
     )
     return History(
-        stable, creeps, changed, seasonal, scale, sigma, float(scipy.special.chdtrc(r, statistic)), rate,
-        weights, total, step,
+        stable, creeps, changed, seasonal, scale, sigma, float(scipy.special.chdtrc(r, statistic)), weights,
+        total, step, np.concatenate([each.growth for each in found]),
     )  # fmt: skip
 
 
@@ -231,7 +251,7 @@ class _Supposed:
     scale: Array
     total: Array
     step: Array
-    rate: Array
+    growth: Array
 
     @classmethod
     def stable(cls, common: Array) -> Self:
@@ -247,7 +267,7 @@ def _all_supposed(runs: RunHistory, common: Array, limit: float, in_force: int) 
 
 
 def _supposed(
-    kind: int, shapes: Array, slopes: Array, runs: RunHistory, limit: float, common: Array, in_force: int
+    kind: int, shapes: Array, growth: Array, runs: RunHistory, limit: float, common: Array, in_force: int
 ) -> _Supposed:
     """Changes of shapes (k, p, n), each a field of random direction and size for every function of time."""
     k, p, r = *shapes.shape[:2], runs.values.shape[1]
@@ -274,19 +294,18 @@ def _supposed(
         fields = np.einsum("mci,ai,kp,akpij->akmcj", runs.basis, sigma, part, to_field, optimize=True)
         return _greatest(fields, mean, cov)
 
-    now = shapes[:, :, -1]
+    now, count = shapes[:, :, -1], len(_SCALES) * len(_WIDTHS)
     if p == 1:  # what is said of one function is in proportion
-        total, count = sizes(now), len(_SCALES) * len(_WIDTHS)
+        total = sizes(now)
         step = total * np.tile(np.repeat(np.abs(now - shapes[:, :, in_force])[:, 0], count), 2)
-        slope = total[0] * np.tile(np.repeat(slopes[:, 0], count), 2)
     else:
-        total, step, slope = sizes(now), sizes(now - shapes[:, :, in_force]), sizes(slopes)[0]
+        total, step = sizes(now), sizes(now - shapes[:, :, in_force])
     scale = np.broadcast_to(_SCALES[:, None], log.shape).ravel()
-    return _Supposed(kind, log.ravel(), scale, total, step, slope)
+    return _Supposed(kind, log.ravel(), scale, total, step, np.tile(np.repeat(growth, count), 2))
 
 
 def _profiles(days: Array) -> dict[int, tuple[Array, Array]]:
-    """Functions of time (k, p, n), 0 at the reference, and their slopes (k, p) now.
+    """Functions of time (k, p, n), 0 at the reference, and the growth (k,) a day of a drift that creeps.
 
     Kinds: 1 creeping, 2 at once, 3 with the seasons.
     """
@@ -294,11 +313,11 @@ def _profiles(days: Array) -> dict[int, tuple[Array, Array]]:
     left = days[-1] - days[: max(1, n - 2)]
     rising = np.maximum(0.0, days - days[: len(left), None]) / left[:, None]
     at_once = np.array([np.arange(n) >= k for k in range(1, n)], dtype=np.float64)
-    found = {2: (at_once[:, None], np.zeros((n - 1, 1)))}
+    found = {2: (at_once[:, None], np.zeros(n - 1))}
     if n > 2:
-        found[1] = rising[:, None], 1 / left[:, None]
+        found[1] = rising[:, None], 1 / left
         year = 2 * np.pi * days / _YEAR
-        found[3] = np.array([[np.sin(year), 1 - np.cos(year)]]), np.zeros((1, 2))
+        found[3] = np.array([[np.sin(year), 1 - np.cos(year)]]), np.zeros(1)
     return found
 
 

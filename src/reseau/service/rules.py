@@ -304,11 +304,11 @@ def _since_reference(
     text = f"drift of {size:.2g} ± {sigma:.2g} {unit} since the reference of {begun:%Y-%m-%d}, "
     text += f"limits {limits.warning:g} and {limits.action:g} {unit}"
     found = [_finding("drift", level, size, limits, text)]
-    left = limits.action - size
-    if count > _RUNS and said.creeps(_ANNOUNCED * limits.action) and left > 0:
-        when = now + timedelta(days=min(left / said.rate_day, 36525.0))
+    days = said.reaches(limits.action, 0.05, 0.5, 0.95)
+    if count > _RUNS and said.creeps(_ANNOUNCED * limits.action) and days[1] > 0:
+        first, about, last = ((now + timedelta(days=each)).date() for each in days)
         text = f"creeps by {7 * said.rate_day:.2g} {unit} a week, and reaches the limit of "
-        text += f"{limits.action:g} {unit} about {when:%Y-%m-%d}"
+        text += f"{limits.action:g} {unit} about {about} ({first} to {last})"
         found.append(_finding("trend", "warning", size, limits, text))
     return found
 
