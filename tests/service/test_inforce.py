@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -355,6 +356,8 @@ def test_a_creeping_drift_is_announced_and_held_back_and_counts_from_the_referen
     assert [bool(each) for each in trends[:6]] == [False, False, False, True, True, True]
     # Six weeks and five days after the first one.
     assert "reaches the limit of 0.4 px about 2026-04-1" in trends[4][0]
+    low, high = re.findall(r"\((\S+) to (\S+)\)", trends[3][0])[0]
+    assert low < "2026-04-17" < high < "2026-05-31"
     last = made[5].key
     with pytest.raises(UsageError, match="was not accepted"):
         known.set_reference("left", made[-1].key, comment="new")
@@ -371,6 +374,15 @@ def test_a_stable_camera_is_accepted(archive: Archive) -> None:
         values = {key: FIRST[key] + 8 * SIGMA[key] * rng.normal() for key in SIGMA}
         found.append(known.decide("left", camera(scale=8.0, **values), RULES, since=day(7 * k)).outcome)
     assert found.count("accepted") >= 19, found
+
+
+def test_the_uncertainty_of_no_change_is_that_of_the_comparison(archive: Archive) -> None:
+    known, _ = started(archive)
+    found = known.decide("left", camera(name="again"), RULES, since=day(7)).judgement.findings
+    text = next(each.text for each in found if each.rule == "image")
+    low, high = (float(each) for each in re.findall(r"a change of (\S+) ± (\S+) px", text)[0])
+    assert low == 0.0
+    assert 0.005 < high < 0.05  # one of a run is 0.01 px
 
 
 @pytest.mark.slow

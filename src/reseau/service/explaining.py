@@ -144,6 +144,7 @@ class History:
     scale: float
     sigma: float
     p: float
+    _log: Array
     _weights: Array
     _total: Array
     _step: Array
@@ -190,10 +191,15 @@ class History:
         return found
 
     def size(self, *, step: bool = False) -> tuple[float, float]:
-        """Return the drift since the reference (or the step) and its standard deviation."""
+        """Return the drift since the reference (or the step) and its standard deviation.
+
+        The latter is that of the models with a change, however improbable: the others have none, which says
+        nothing of how small a change can be seen.
+        """
         size, sigma = self._step if step else self._total
-        mean = float(self._weights @ size)
-        return mean, float(np.sqrt(self._weights @ (sigma**2 + (size - mean) ** 2)))
+        mean, some = float(self._weights @ size), size > 0
+        weights = scipy.special.softmax(self._log[some])
+        return mean, float(np.sqrt(weights @ (sigma**2 + (size - mean) ** 2)[some]))
 
 
 def explain_runs(runs: RunHistory, limit: float, in_force: int) -> History:
@@ -224,8 +230,7 @@ def explain_runs(runs: RunHistory, limit: float, in_force: int) -> History:
         common = others.evidence() + runs.own_errors(runs.rejected, others.mean()[1], limit)
         found += _all_supposed(others, common, limit, now_in_force)
     log = np.concatenate([each.log for each in found])
-    weights = np.exp(log - log.max())
-    weights /= weights.sum()
+    weights = scipy.special.softmax(log)
     kinds = np.repeat([each.kind for each in found], [len(each.log) for each in found])
     stable, creeps, changed, seasonal = (float(weights[kinds == each].sum()) for each in range(4))
     n, r = runs.values.shape
@@ -237,7 +242,7 @@ def explain_runs(runs: RunHistory, limit: float, in_force: int) -> History:
         np.concatenate(each, axis=1) for each in zip(*((f.total, f.step) for f in found), strict=True)
     )
     return History(
-        stable, creeps, changed, seasonal, scale, sigma, float(scipy.special.chdtrc(r, statistic)), weights,
+        stable, creeps, changed, seasonal, scale, sigma, float(scipy.special.chdtrc(r, statistic)), log, weights,
         total, step, np.concatenate([each.growth for each in found]),
     )  # fmt: skip
 

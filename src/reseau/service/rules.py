@@ -31,6 +31,7 @@ from pydantic import Field, model_validator
 from ..calibration import Calibration
 from ..calibration.conversion import in_model_of
 from ..core.errors import UsageError
+from ..core.numbers import measured
 from ..io import Document, Strict
 from .explaining import History, RunHistory, explain_runs
 from .fields import change, difference
@@ -290,8 +291,8 @@ def _step(said: History, outside: float, greatest: float, unit: str, limits: Lim
     """The change since the calibration in force."""
     size, sigma = said.size(step=True)
     level = _worst(_level(said, limits, step=True), limits.level(outside))
-    text = f"largest difference {greatest:.3g} {unit}, a change of {max(size, outside):.2g} ± {sigma:.2g} "
-    text += f"{unit}, limits {limits.warning:g} and {limits.action:g} {unit}"
+    text = f"largest difference {greatest:.3g} {unit}, a change of {measured(max(size, outside), sigma, unit)}"
+    text += f", limits {limits.warning:g} and {limits.action:g} {unit}"
     return _finding("image", level, max(size, outside), limits, text)
 
 
@@ -301,7 +302,7 @@ def _since_reference(
     """The drift since the reference, and when a trend will reach the limit."""
     size, sigma = said.size()
     level = _level(said, limits, step=False)
-    text = f"drift of {size:.2g} ± {sigma:.2g} {unit} since the reference of {begun:%Y-%m-%d}, "
+    text = f"drift of {measured(size, sigma, unit)} since the reference of {begun:%Y-%m-%d}, "
     text += f"limits {limits.warning:g} and {limits.action:g} {unit}"
     found = [_finding("drift", level, size, limits, text)]
     days = said.reaches(limits.action, 0.05, 0.5, 0.95)
