@@ -17,6 +17,7 @@ from reseau.calibration.document import Covariance, Quantity
 from reseau.cli import run
 from reseau.core.errors import FormatError, UsageError
 from reseau.service import AcceptanceRules, Configurations, Limits, judge
+from reseau.service.explaining import RunHistory, explain_runs
 from reseau.service.fields import difference
 
 START = datetime(2026, 3, 2, 8, 0, tzinfo=UTC)
@@ -376,13 +377,17 @@ def test_a_stable_camera_is_accepted(archive: Archive) -> None:
     assert found.count("accepted") >= 19, found
 
 
-def test_the_uncertainty_of_no_change_is_that_of_the_comparison(archive: Archive) -> None:
-    known, _ = started(archive)
-    found = known.decide("left", camera(name="again"), RULES, since=day(7)).judgement.findings
+def test_the_uncertainty_of_no_change_is_that_of_the_comparison() -> None:
+    # The same photographs again: a difference of exactly nothing.
+    found = judge(camera(name="again"), camera(), RULES).findings
     text = next(each.text for each in found if each.rule == "image")
     low, high = (float(each) for each in re.findall(r"a change of (\S+) ± (\S+) px", text)[0])
     assert low == 0.0
     assert 0.005 < high < 0.05  # one of a run is 0.01 px
+    exact = RunHistory(np.array([0.0, 7.0]), np.zeros((2, 1)), np.ones((2, 1, 1)), np.full((1, 2, 1), 0.01))
+    size, sigma = explain_runs(exact, 0.4, 0).size(step=True)
+    assert size == 0.0
+    assert 0.005 < sigma < 0.05
 
 
 @pytest.mark.slow

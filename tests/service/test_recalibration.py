@@ -33,6 +33,7 @@ from reseau.service import (
 from reseau.service.alarms import sender
 
 from ..capture.fieldrig import TESTFIELD, FieldRig, enter, write_inputs
+from .http.test_benches import until
 from .test_inforce import RULES as CAMERA_RULES
 from .test_inforce import camera
 
@@ -360,6 +361,46 @@ def test_alarms_are_sent_once_and_repeated_until_they_are_acknowledged(
         assert len(received) == 4
         with pytest.raises(UsageError, match="is no alarm"):
             alarms.acknowledge("something", "Ada")
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_the_service_sends_alarms_where_an_administrator_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("apprise", reason="needs apprise (extra `service`)")
+    from .http.served import served
+
+    received: list[bytes] = []
+
+    class Hook(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            received.append(self.rfile.read(int(self.headers["Content-Length"])))
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            """Nothing."""
+
+    monkeypatch.setattr("reseau.service.http.service._ALARMS_S", 0.1)
+    with ThreadingHTTPServer(("127.0.0.1", 0), Hook) as server, served(tmp_path) as one:
+        threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+        address = f"json://127.0.0.1:{server.server_port}/alarms"
+        known = Configurations(one.service.archive)
+        known.define("left", {"camera": "DMK 33"})
+        key = known.decide("left", camera(), CAMERA_RULES).key
+        to = {"notify": [address], "inside": ["127.0.0.1"]}
+        where = "/api/1/alarms/delivery"
+        assert one.client("operate").put(where, json=to).status_code == 403
+        wrong = one.client().put(where, json=to | {"notify": ["nothing"]})
+        assert (wrong.status_code, wrong.json()["error"]["text"]) == (
+            422, "address 1: cannot be used; see the URLs of apprise",
+        )  # fmt: skip
+        assert one.client().put(where, json=to).status_code == 200
+        until(lambda: received, 60)
+        assert key in received[0].decode()
+        server.shutdown()
+        assert address in one.client().get("/history").text
+        assert address not in one.client("operate").get("/history").text
 
 
 def test_calibrations_that_cannot_be_charted_together_are_an_alarm(tmp_path: Path) -> None:

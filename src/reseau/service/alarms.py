@@ -13,10 +13,14 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from typing import ClassVar
+
+from pydantic import Field
 
 from ..archive import Archive
 from ..core.errors import InputError, UsageError
 from ..core.optional import optional
+from ..io import Document
 from .delivering import networks_of
 from .inforce import Configurations, a_time
 from .schedule import Schedules
@@ -49,6 +53,31 @@ class Alarm:
     text: str
     sent: tuple[datetime, ...] = ()
     acknowledged: str = ""
+
+
+class AlarmDelivery(Document):
+    """Where a service sends alarms, ``reseau-alarm-delivery/1``.
+
+    Parameters
+    ----------
+    notify : tuple of str
+        Addresses to which alarms are sent, as mailtos://user:password@example.org (URLs of apprise).
+    inside : tuple of str
+        Networks of the laboratory to which they may be sent, such as 192.168.1.0/24.
+    repeat_hours : float
+        Time after which an alarm that nobody acknowledged is sent again (h).
+
+    Examples
+    --------
+    >>> AlarmDelivery(notify=("mailto://user:password@example.org",)).repeat_hours
+    24.0
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-alarm-delivery/1"
+
+    notify: tuple[str, ...] = ()
+    inside: tuple[str, ...] = ()
+    repeat_hours: float = Field(default=24.0, ge=0.1, le=8760)
 
 
 class Alarms:
@@ -99,6 +128,30 @@ class Alarms:
         if key not in {each.key for each in self.all()}:
             raise UsageError("is no alarm", where=repr(key), do="see `reseau alarms list`")
         self._journal.append(f"acknowledged {key}", "acknowledged", {"alarm": key, "by": by})
+
+    @property
+    def delivery(self) -> AlarmDelivery:
+        """Where a service sends them."""
+        content = [dict(each.document) for each in self._journal.entries("delivery")]
+        return AlarmDelivery.from_content(content[-1], where="alarms") if content else AlarmDelivery()
+
+    def deliver_to(self, delivery: AlarmDelivery) -> None:
+        """Set where a service sends them.
+
+        Raises
+        ------
+        UsageError
+            If one is not a URL of apprise or a network.
+        """
+        sender(delivery.notify, delivery.inside)
+        self._journal.add("delivery", delivery.to_dict())
+
+    def send_as_set(self) -> list[Alarm]:
+        """Send what is due where it is set; raises as :meth:`send`."""
+        to = self.delivery
+        if not to.notify:
+            return []
+        return self.send(sender(to.notify, to.inside), timedelta(hours=to.repeat_hours))
 
     def send(
         self, deliver: Callable[[str, str], bool], repeat: timedelta, now: datetime | None = None

@@ -179,7 +179,7 @@ class BenchLink:
             self._wire, self._met = wire, True
             self._on_event("up", {})
             try:
-                threading.Thread(target=self._greet, daemon=True).start()
+                wire.send({"id": 0, "do": "status"})
                 while True:
                     self._received(*wire.receive())
             except ReseauError:
@@ -198,11 +198,6 @@ class BenchLink:
                     pause = _PAUSE_S
                 self._over.wait(pause)
                 pause = min(2 * pause, _LONGEST_PAUSE_S)
-
-    def _greet(self) -> None:
-        with contextlib.suppress(ReseauError):
-            self._status = self.request("status")
-            self._on_event("status", {})
 
     def _received(self, header: dict[str, Any], body: bytes) -> None:
         if "event" in header:
@@ -231,9 +226,7 @@ class BenchLink:
         if about.get("bench") == self.text:
             return wire
         with contextlib.suppress(ReseauError):  # the file was changed: the worker ends when it is idle
-            wire.send({"id": 0, "do": "end"})
-            answer, _ = wire.receive()
-            if "error" in answer:
+            if "error" in _answer(wire, "end"):
                 return wire
         wire.close()
         time.sleep(1.0)
@@ -271,8 +264,7 @@ class BenchLink:
         """The connection to a worker on another machine; None, with the reason, if it is no right one."""
         try:
             wire = self._connected(port, host)
-            wire.send({"id": 0, "do": "bench"})
-            answer, _ = wire.receive()
+            answer = _answer(wire, "bench")
         except (OSError, ReseauError) as error:
             self._wrong = f"its worker on {host} does not answer ({error})"
             return None
@@ -293,6 +285,14 @@ class BenchLink:
             raw.close()
             raise
         return Wire(sock)
+
+
+def _answer(wire: Wire, do: str) -> dict[str, Any]:
+    """Have a worker do something that it does at once, before its events are followed."""
+    wire.send({"id": 0, "do": do})
+    while "event" in (answer := wire.receive()[0]):
+        pass
+    return answer
 
 
 _AT_ONCE = frozenset(

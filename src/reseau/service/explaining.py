@@ -197,7 +197,7 @@ class History:
         nothing of how small a change can be seen.
         """
         size, sigma = self._step if step else self._total
-        mean, some = float(self._weights @ size), size > 0
+        mean, some = float(self._weights @ size), sigma > 0
         weights = scipy.special.softmax(self._log[some])
         return mean, float(np.sqrt(weights @ (sigma**2 + (size - mean) ** 2)[some]))
 
@@ -242,8 +242,8 @@ def explain_runs(runs: RunHistory, limit: float, in_force: int) -> History:
         np.concatenate(each, axis=1) for each in zip(*((f.total, f.step) for f in found), strict=True)
     )
     return History(
-        stable, creeps, changed, seasonal, scale, sigma, float(scipy.special.chdtrc(r, statistic)), log, weights,
-        total, step, np.concatenate([each.growth for each in found]),
+        stable, creeps, changed, seasonal, scale, sigma, float(scipy.special.chdtrc(r, statistic)), log,
+        weights, total, step, np.concatenate([each.growth for each in found]),
     )  # fmt: skip
 
 
@@ -310,7 +310,7 @@ def _supposed(
 
 
 def _profiles(days: Array) -> dict[int, tuple[Array, Array]]:
-    """Functions of time (k, p, n), 0 at the reference, and the growth (k,) a day of a drift that creeps.
+    """Functions of time (k, p, n), 0 at the reference, and the growth (k,) a day of what creeps.
 
     Kinds: 1 creeping, 2 at once, 3 with the seasons.
     """
@@ -334,7 +334,8 @@ def _greatest(fields: Array, mean: Array, cov: Array) -> Array:
     square = np.square(there).sum(axis=-1)
     where = np.argmax(square, axis=-1)[..., None]
     most = np.sqrt(np.take_along_axis(square, where, axis=-1))
-    along = np.take_along_axis(there, where[..., None], axis=-2)[..., 0, :] / np.maximum(most, 1e-300)
+    along = np.take_along_axis(there, where[..., None], axis=-2)[..., 0, :]
+    along = np.where(most > 0, along / np.maximum(most, 1e-300), [1.0, 0.0])  # no change: any direction
     rows = fields[np.arange(a)[:, None, None], np.arange(k)[:, None], where[..., 0]]
     by = (rows * along[..., None]).sum(axis=-2)
     sigma = np.sqrt((np.square(by) * cov.reshape(a, k, -1, j)).sum(axis=-1))

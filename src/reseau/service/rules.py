@@ -291,7 +291,9 @@ def _step(said: History, outside: float, greatest: float, unit: str, limits: Lim
     """The change since the calibration in force."""
     size, sigma = said.size(step=True)
     level = _worst(_level(said, limits, step=True), limits.level(outside))
-    text = f"largest difference {greatest:.3g} {unit}, a change of {measured(max(size, outside), sigma, unit)}"
+    text = (
+        f"largest difference {greatest:.3g} {unit}, a change of {measured(max(size, outside), sigma, unit)}"
+    )
     text += f", limits {limits.warning:g} and {limits.action:g} {unit}"
     return _finding("image", level, max(size, outside), limits, text)
 

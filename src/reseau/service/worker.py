@@ -88,7 +88,7 @@ class Worker:
         every = Bench(self.file)
         self._bench = every.part(every.instruments, required=())
         self._silent: dict[str, ReseauError] = {}
-        self._lock = threading.RLock()
+        self._lock, self._saying = threading.RLock(), threading.Lock()
         self._wires: set[Wire] = set()
         self._commands: queue.Queue[tuple[Wire, dict[str, Any]]] = queue.Queue()
         self._held: contextlib.ExitStack | None = None
@@ -196,12 +196,14 @@ class Worker:
         }  # fmt: skip
 
     def _say(self, kind: str, facts: dict[str, Any] | None = None) -> None:
-        message = {"event": kind, "facts": facts or {}, "status": self.status()}
-        for wire in list(self._wires):
-            try:
-                wire.send(message)
-            except ReseauError:
-                self._wires.discard(wire)
+        """Tell services what happened, and the state: no older one is sent after a newer one."""
+        with self._saying:
+            message = {"event": kind, "facts": facts or {}, "status": self.status()}
+            for wire in list(self._wires):
+                try:
+                    wire.send(message)
+                except ReseauError:
+                    self._wires.discard(wire)
 
     # Commands.
 
@@ -374,6 +376,8 @@ class Worker:
                 threading.Thread(target=self._insist, args=(self._stops,), daemon=True).start()
             self._say("stopped", {"ms": round(1e3 * spent, 1)})
             return True, {"ms": round(1e3 * spent, 1), **self.status()}, b""
+        if what == "status":  # in its turn among the events, so that none that is older follows it
+            self._say("status")
         asked = {"status": self.status, "bench": lambda: self.text, "settings": self._settings}.get(str(what))
         if asked is not None:
             return True, asked(), b""

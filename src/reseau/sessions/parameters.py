@@ -210,7 +210,7 @@ class SessionParameters(Document):
         lost = [axis for axis in moved if not table.state(axis).homed]
         if lost:
             have = "have no reference" if len(lost) > 1 else "has no reference"
-            do = "give --home, or run `reseau bench home`"
+            do = "home them first, or have the session do it (--home)"
             raise StateError(f"{', '.join(lost)} {have}", where=table.name, do=do)
 
 

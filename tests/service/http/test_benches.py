@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
 import ssl
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +23,7 @@ from reseau.core.errors import StateError
 from reseau.service import worker
 from reseau.service.benches import BenchLink
 from reseau.service.state import StateFolder
-from reseau.service.wire import Certificates
+from reseau.service.wire import Certificates, Wire
 from reseau_sims.serving.bench import SimulatedBench
 
 from ...capture.fieldrig import DESIGN, FieldRig
@@ -31,6 +33,7 @@ from .served import Served, TestClient, served
 
 BENCH = "/api/1/benches/cellar"
 ROOT = Path(__file__).resolve().parents[3]
+EMPTY = 'schema = "reseau-bench/1"\nname = "cellar"\n[instruments]\n'
 
 
 class Rig:
@@ -71,13 +74,69 @@ def state(client: TestClient, *wanted: str, seconds: float = 180.0) -> dict[str,
 
 
 def test_a_bench_whose_first_worker_has_not_answered_yet_is_starting(tmp_path: Path) -> None:
-    (tmp_path / "bench.toml").write_text('schema = "reseau-bench/1"\nname = "cellar"\n[instruments]\n')
+    (tmp_path / "bench.toml").write_text(EMPTY)
     link = BenchLink(tmp_path / "bench.toml", "archive", None, StateFolder(tmp_path / "s"), lambda *_: None)
     assert (link.status["state"], link.status["error"]) == ("starting", "")
     link.restarts = 0  # its process has begun
     assert (link.status["state"], link.status["error"]) == ("starting", "")
     link.restarts = 1
     assert (link.status["state"], link.status["error"]) == ("down", "its worker does not answer")
+
+
+def test_the_state_that_a_worker_says_last_is_the_one_that_counts(tmp_path: Path) -> None:
+    (tmp_path / "bench.toml").write_text(EMPTY)
+    state, made = StateFolder(tmp_path / "s"), []
+    certificates = Certificates(state)
+
+    def answer(server: socket.socket) -> None:
+        for _ in range(20):
+            sock = certificates.context("worker").wrap_socket(server.accept()[0], server_side=True)
+            wire = Wire(sock)
+            number = wire.receive()[0]["id"]
+            down = {"state": "down", "error": "not connected yet"}
+            wire.send({"event": "status", "status": down})
+            wire.send({"id": number, "value": down})
+            wire.send({"event": "bench", "status": {"state": "ready"}})
+            made.append(wire)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        about = {"port": server.getsockname()[1], "pid": os.getpid(), "bench": EMPTY}
+        worker.address_file(state, "cellar").write_text(json.dumps(about))
+        threading.Thread(target=answer, args=(server,), daemon=True).start()
+        for number in range(1, 21):
+            link = BenchLink(tmp_path / "bench.toml", "archive", None, state, lambda *_: None)
+            link.start()
+            until(lambda: len(made) == number)  # noqa: B023
+            until(lambda: link.status["state"] == "ready", 2)  # noqa: B023
+            time.sleep(0.02)
+            assert link.status["state"] == "ready"
+            link._over.set()
+            made[-1].close()
+
+
+def test_a_worker_says_no_state_after_a_newer_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Archive.open(tmp_path / "archive", create=True) as archive:
+        made = worker.Worker(EMPTY, archive, Certificates(StateFolder(tmp_path / "s")))
+        here, there = socket.socketpair()
+        with here, there:
+            made._wires.add(Wire(here))
+            told, slow = Wire(there), threading.Event()
+            first = made.status()
+
+            def status() -> dict[str, Any]:
+                if slow.is_set():
+                    return first | {"state": "ready"}
+                slow.set()
+                time.sleep(0.2)
+                return first
+
+            monkeypatch.setattr(made, "status", status)
+            asking = threading.Thread(target=made._say, args=("status",))
+            asking.start()
+            slow.wait()
+            made._say("bench")
+            asking.join()
+            assert [told.receive()[0]["status"]["state"] for _ in range(2)] == ["down", "ready"]
 
 
 @pytest.fixture(scope="module")
@@ -124,8 +183,6 @@ def test_an_axis_is_moved_within_its_limits_and_recorded(one: Served, rig: Rig) 
 def test_a_stop_acts_at_once_and_is_not_queued(
     one: Served, rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import threading
-
     client, answers, asked, record = one.client("operate"), [], list[str](), one.service.audit.record
     client.post(f"{BENCH}/move", json={"axis": "tilt", "position": 0.0})
 
@@ -162,8 +219,6 @@ def test_a_stop_acts_at_once_and_is_not_queued(
 def test_what_was_asked_for_before_a_stop_is_not_done_after_it(
     one: Served, rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import threading
-
     asked, stopped, record = threading.Event(), threading.Event(), one.service.audit.record
 
     def slow(by: str, via: str, action: str, *more: Any) -> Any:
@@ -307,8 +362,6 @@ def test_a_released_bench_is_free_for_others_and_taken_again(one: Served, rig: R
 
 @pytest.mark.slow  # the worker has to be back before the axis arrives, which a loaded machine does not grant
 def test_a_killed_worker_is_shown_restarted_and_leaves_nothing_moving(one: Served, rig: Rig) -> None:
-    import threading
-
     client = one.client("operate")
     client.post(f"{BENCH}/move", json={"axis": "roll", "position": 0.0})
     answers: list[Any] = []
@@ -388,8 +441,6 @@ def test_the_worker_answers_only_with_certificates(tmp_path: Path) -> None:
     own, other = (Certificates(StateFolder(tmp_path / name)) for name in ("own", "other"))
     for context, role in ((other.context("service"), "foreign"), (own.context("service"), "own")):
         here, there = socket.socketpair()
-        import threading
-
         outcome: list[str] = []
 
         def serve(sock: socket.socket = there, outcome: list[str] = outcome) -> None:
@@ -481,8 +532,6 @@ def test_a_defect_of_a_driver_is_an_answer_and_a_crash_restarts_the_worker(one: 
 
 
 def test_positions_are_reported_while_an_axis_moves_and_who_moves_it(one: Served, rig: Rig) -> None:
-    import threading
-
     client = one.client("operate")
     client.post(f"{BENCH}/move", json={"axis": "roll", "position": 0.0})
     mover = threading.Thread(

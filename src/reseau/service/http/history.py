@@ -140,6 +140,14 @@ class AlarmRow(Answer):
     acknowledged: str
 
 
+class Delivery(Answer, json_schema_extra={"example": {"notify": ["mailtos://lab:secret@example.org"]}}):
+    """Where alarms are sent, and after how long again."""
+
+    notify: list[Annotated[str, Field(max_length=500)]] = Field(default_factory=list, max_length=10)
+    inside: list[Annotated[str, Field(max_length=50)]] = Field(default_factory=list, max_length=10)
+    repeat_hours: float = Field(default=24.0, ge=0.1, le=8760)
+
+
 class Acknowledged(Answer):
     """Keys of alarms."""
 
@@ -357,6 +365,17 @@ def alarms(
 ) -> list[AlarmRow]:
     """Alarms that nobody acknowledged, or all."""
     return [each for each in all_alarms(service) if everything or not each.acknowledged]
+
+
+@router.put("/alarms/delivery")
+def deliver(given: Delivery, who: Administering, service: Here) -> Done:
+    """Set where the service sends alarms."""
+    from ..alarms import AlarmDelivery, Alarms
+
+    made = AlarmDelivery.from_content({"schema": AlarmDelivery.SCHEMA, **given.model_dump()}, where="alarms")
+    with service.audited(who, "send alarms", "alarms", {"addresses": len(made.notify)}):
+        Alarms(service.archive).deliver_to(made)
+    return Done(done=f"sent to {len(made.notify)} addresses" if made.notify else "sent nowhere")
 
 
 @router.post("/alarms/acknowledge")

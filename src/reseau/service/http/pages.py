@@ -414,8 +414,10 @@ def files_page(request: Request, who: Reading, service: Here) -> Response:
 @router.get("/history")
 def history_page(request: Request, who: Reading, service: Here) -> Response:
     """Alarms, reviews, schedules and drift."""
+    from ..alarms import AlarmDelivery, Alarms
     from ..recalibration import Recalibration
 
+    sent_to = Alarms(service.archive).delivery.to_dict() if who.may("administer") else {}
     alarms = history.all_alarms(service)
     found = calibrations.listed(service)
     waiting = [
@@ -431,6 +433,7 @@ def history_page(request: Request, who: Reading, service: Here) -> Response:
         configurations=found, to_review=waiting, recalibrations=orders.every_recalibration(service),
         sessions=comparisons.calibrated(service), schedule=_schedule_form(),
         repeated=form_of(Recalibration, prefix="", but=_OF_SESSION),
+        delivery=form_of(AlarmDelivery, sent_to), unsent=service.unsent,
     )  # fmt: skip
 
 

@@ -49,6 +49,8 @@ def _load_the_rest(over: threading.Event) -> None:
 
 
 _LOOK_S, _ENTRY_S, _REST_S = 0.3, 600.0, 3.0
+_ALARMS_S = 30.0
+"""Time between looks at alarms that are to be sent."""
 _LOGGED = frozenset({"up", "down", "begin", "session", "end", "moving", "stopped", "asking"})
 """Events of benches that the log has, and not only the streams of events."""
 _MOST_COMPUTED = 200
@@ -128,10 +130,11 @@ class Service:
         self._computing = threading.Lock()
         self._over = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="archive", daemon=True)
-        self.failing = ""
+        self.failing = self.unsent = ""
 
     def __enter__(self) -> Service:
         self._watcher.start()
+        threading.Thread(target=self._send_alarms, name="alarms", daemon=True).start()
         threading.Thread(target=_load_the_rest, args=(self._over,), name="load", daemon=True).start()
         self.jobs.start(self.archive)
         if self.tiled is not None:
@@ -264,6 +267,18 @@ class Service:
                     self.events.publish("archive", table, {"last": last})
                     self.meters.events.labels("archive").inc()
             before = now
+
+    def _send_alarms(self) -> None:
+        """Send alarms as it is set; what could not be sent is said on the page, and tried again."""
+        from ..alarms import Alarms
+
+        while not self._over.wait(_ALARMS_S):
+            try:
+                Alarms(self.archive).send_as_set()
+                self.unsent = ""
+            except Exception as error:  # whatever it is, the next alarm is sent, too
+                log("alarms", failed=str(error))
+                self.unsent = str(error)
 
 
 _LONGEST_S = 3600.0

@@ -89,6 +89,13 @@ async function with_files(form, body) {
     const [group, key] = input.dataset.text.split('.');
     if (input.files.length) body[group][key] = await input.files[0].text();
   }
+  for (const table of form.querySelectorAll('[data-rows]')) {  // rows filled in by hand, as the file would have them
+    const rows = [...table.querySelectorAll('tbody tr')].map(row => [...row.querySelectorAll('input:enabled')]);
+    const used = (rows[0] ?? []).map((_, k) => k).filter(k => rows.some(row => row[k].value !== ''));
+    if (!used.length) continue;
+    const lines = [used.map(k => rows[0][k].dataset.column), ...rows.map(row => used.map(k => row[k].value.replace(/[",]/g, ' ')))];
+    body.texts[table.dataset.rows] = lines.map(line => line.join(',')).join('\n');
+  }
   return body;
 }
 
@@ -164,6 +171,28 @@ document.addEventListener('click', event => {
   }
   act(button, body);
 });
+
+// Rows that are filled in by hand.
+for (const table of document.querySelectorAll('[data-rows]')) {
+  const rows = table.querySelector('tbody');
+  table.addEventListener('click', event => {
+    const button = event.target.closest('button');
+    if (!button) return;
+    event.preventDefault();
+    if (button.dataset.remove !== undefined) button.closest('tr').remove();
+    else {
+      const before = [...rows.lastElementChild?.querySelectorAll('input') ?? []];
+      rows.append(table.querySelector('template').content.cloneNode(true));
+      [...rows.lastElementChild.querySelectorAll('input')].forEach((input, k) => {
+        const now = document.querySelector(`[data-position="${input.dataset.column}"]`);
+        if (input.dataset.column === 'name') input.value = `pose ${rows.children.length}`;
+        else input.value = button.dataset.add === 'here' && now ? Number.parseFloat(now.textContent) : before[k]?.value ?? '';
+      });
+      rows.lastElementChild.querySelector('input').focus();
+    }
+    table.querySelector('table').hidden = !rows.children.length;
+  });
+}
 
 // Fields that belong to what is chosen; those of other choices are neither shown nor sent.
 for (const choice of document.querySelectorAll('[data-choose]')) {
