@@ -13,25 +13,34 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager, suppress
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from reseau.archive import Archive
 from reseau.archive.verification import verify
+from reseau.capture import Bench, BenchFile
 from reseau.core.data import Frame
 from reseau.core.errors import ArchiveError, InputError
 from reseau.service.http.options import ServeOptions
 from reseau.service.http.service import Service
 from reseau.service.orders import Orders
 from reseau.service.upkeep import backup, restore
+from reseau_sims.serving import FaultyConnection, TcpServer
+from reseau_sims.serving.bench import SimulatedBench
 
+from ..capture.fieldrig import DESIGN
+from .http.driver import bench_of, install
+from .http.populated import PARAMETERS, STEPS
 from .http.proxy import Proxy
 from .http.served import Served, served
-from .http.test_benches import ROOT, until
+from .http.test_benches import BENCH, ROOT, state, until
 
 pytestmark = pytest.mark.slow
 
@@ -149,6 +158,73 @@ def test_a_full_disk_is_one_line_and_what_was_stored_stays_whole(small_disk: Pat
     print(f"{stored} frames stored before: {done.stdout.strip()}")
 
 
+def _configured(client: Any, name: str) -> tuple[int, str]:
+    """Status and text of the error where a configuration is defined."""
+    answer = client.post("/api/1/configurations", json={"name": name, "parts": {"camera": name}})
+    return answer.status_code, answer.json().get("error", {}).get("text", "")
+
+
+def test_a_service_whose_disk_is_full_says_so_reads_on_and_goes_on_when_there_is_room(
+    small_disk: Path,
+) -> None:
+    with Archive.open(small_disk / "archive", create=True) as archive:
+        archive.begin("monday", "frames", {"count": 1}).end("done")
+    with served(small_disk) as one:
+        client = one.client()
+        assert _configured(client, "left") == (201, "")
+        for size in (1 << 16, 1 << 12):  # to the last page
+            with suppress(OSError), (small_disk / "filler").open("ab", buffering=0) as filler:
+                while True:
+                    filler.write(bytes(size))
+        status, text = _configured(client, "right")
+        assert status == 503
+        assert "full" in text
+        assert len(text.splitlines()) == 1
+        assert client.get("/api/1/sessions/monday").json()["status"] == "done"
+        assert client.get("/").status_code == 200
+        (small_disk / "filler").unlink()
+        assert _configured(client, "right") == (201, "")
+        assert [each["name"] for each in client.get("/api/1/configurations").json()] == ["left", "right"]
+    with Archive.open(small_disk / "archive") as archive:
+        assert verify(archive)
+
+
+@contextmanager
+def _read_only(folder: Path) -> Iterator[None]:
+    """Have nothing in a folder opened for writing, as on a disk that the system made read-only."""
+    subprocess.run(["mount", "--bind", folder, folder], check=True)
+    try:
+        subprocess.run(["mount", "-o", "remount,bind,ro", folder], check=True)
+        yield
+    finally:
+        subprocess.run(["umount", "-l", folder], check=True)
+
+
+def test_a_service_whose_disk_becomes_read_only_says_so_reads_on_and_goes_on_afterwards(
+    small_disk: Path,
+) -> None:
+    with served(small_disk) as one:
+        client = one.client()
+
+        def upload(name: str) -> Any:
+            picture = np.full((64, 64), 128, dtype=np.uint8)
+            photograph = ("photographs", ("a.png", cv2.imencode(".png", picture)[1].tobytes()))
+            design = ("design", ("design.json", DESIGN.to_json().encode(), "application/json"))
+            return client.post("/api/1/uploads", data={"name": name}, files=[photograph, design])
+
+        with _read_only(small_disk / "archive"):
+            answer = upload("while read-only")
+            assert answer.status_code == 503, answer.text
+            text = answer.json()["error"]["text"]
+            assert "ead-only" in text
+            assert len(text.splitlines()) == 1
+            assert client.get("/").status_code == 200
+            assert client.get("/api/1/sessions").status_code == 200
+        assert upload("afterwards").status_code == 202
+    with Archive.open(small_disk / "archive") as archive:
+        assert verify(archive)
+
+
 def test_a_limit_of_files_acts_as_a_full_disk(tmp_path: Path) -> None:
     def small() -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -166,18 +242,19 @@ def test_a_limit_of_files_acts_as_a_full_disk(tmp_path: Path) -> None:
         assert verify(archive)
 
 
-def test_of_two_services_on_an_archive_one_has_the_bench_and_each_order_is_done_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from reseau_sims.serving.bench import SimulatedBench
-
-    from .http.driver import bench_of, install
-
+@pytest.fixture
+def workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worker processes find the camera of the tests, and keep their locks apart from those of others."""
     install(tmp_path / "drivers")
     paths = [str(tmp_path / "drivers"), str(ROOT), os.environ.get("PYTHONPATH", "")]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+
+
+def test_of_two_services_on_an_archive_one_has_the_bench_and_each_order_is_done_once(
+    tmp_path: Path, workers: None
+) -> None:
     with SimulatedBench(seed=3) as sim:
         bench = tmp_path / "bench.toml"
         bench.write_text(bench_of(sim.toml))
@@ -240,8 +317,6 @@ def test_instruments_that_stand_still_are_named_within_their_deadline_and_answer
         "with SimulatedBench(seed=3) as sim:\n    print(sim.toml, flush=True)\n    print('END', flush=True)\n"
         "    time.sleep(600)\n"
     )
-    from reseau.capture import Bench, BenchFile
-
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         lines = list(iter(process.stdout.readline, "END\n"))
@@ -258,3 +333,90 @@ def test_instruments_that_stand_still_are_named_within_their_deadline_and_answer
             assert spent < 30, spent
             until(lambda: all(each.error is None for each in bench.check(20)), 90)
         process.kill()
+
+
+def test_each_instrument_that_stands_still_or_is_unplugged_is_named_while_the_others_work() -> None:
+    with ExitStack() as stack:
+        sim = stack.enter_context(SimulatedBench(seed=3, scanner="all", environment="scpi"))
+        file = BenchFile.parse_toml(sim.toml, where="bench")
+        ports, plugs, entries = dict[str, int](), dict[str, Proxy](), dict(file.instruments)
+        for name, machine in sim.machines.items():
+            if entries[name].address == "in this process":
+                continue
+            if name == "oscilloscope":
+                ports[name] = int(entries[name].address.split(",")[1].split(":")[0])
+            else:
+                server = TcpServer(partial(FaultyConnection, machine, sim.scripts[name]))
+                ports[name] = int(stack.enter_context(server).address.rpartition(":")[2])
+            plugs[name] = Proxy(ports[name])
+            stack.callback(lambda name=name: plugs[name].__exit__(None, None, None))
+            there = f"tcp://127.0.0.1:{plugs[name].port}"
+            if name == "oscilloscope":
+                there = f"TCPIP::127.0.0.1,{plugs[name].port}::inst0::INSTR"
+            entries[name] = entries[name].model_copy(update={"address": there})
+        bench = stack.enter_context(Bench(file.model_copy(update={"instruments": entries})))
+
+        def wrong() -> dict[str, str]:
+            return {each.name: str(each.error) for each in bench.check(5) if each.error is not None}
+
+        until(lambda: not wrong(), 90)
+        for name in plugs:
+            for how in ("stands still", "unplugged"):
+                if how == "stands still":
+                    plugs[name].hold()
+                else:
+                    plugs[name].__exit__(None, None, None)
+                begun = time.monotonic()
+                found = wrong()
+                spent = time.monotonic() - begun
+                print(f"{name} {how}: {found} in {spent:.1f} s")
+                assert name in found, (name, how)
+                assert name in found[name]
+                assert len(found[name].splitlines()) == 1
+                assert spent < 30
+                # What consists of other instruments fails with them; the others work.
+                until(lambda name=name: name in (now := wrong()) and set(now) <= {name, "pulser"}, 60)
+                if how == "stands still":
+                    plugs[name].release()
+                else:
+                    plugs[name] = Proxy(ports[name], port=plugs[name].port)
+                until(lambda: not wrong(), 90)
+
+
+def test_a_session_whose_table_is_unplugged_is_resumed_to_its_end(tmp_path: Path, workers: None) -> None:
+    with SimulatedBench(seed=3) as sim, ExitStack() as stack:
+        server = TcpServer(partial(FaultyConnection, sim.machines["table"], sim.scripts["table"]))
+        port = int(stack.enter_context(server).address.rpartition(":")[2])
+        plug = Proxy(port)
+        address = BenchFile.parse_toml(sim.toml, where="bench").instruments["table"].address
+        bench = tmp_path / "bench.toml"
+        bench.write_text(bench_of(sim.toml).replace(address, f"tcp://127.0.0.1:{plug.port}"))
+        with served(tmp_path, benches=(bench,)) as one:
+            client = one.client("operate")
+            state(client, "ready")
+            for axis in ("tilt", "roll", "camera_roll"):
+                assert client.post(f"{BENCH}/home", json={"axis": axis}).status_code == 200
+            new = {"name": "monday", "plan": "testfield", "parameters": dict(PARAMETERS)}
+            new["inputs"] = {"design.json": DESIGN.to_json()}
+            assert client.post(f"{BENCH}/sessions", json=new).status_code == 201
+            until(lambda: client.get(BENCH).json()["session"]["good"] >= 1)
+            plug.__exit__(None, None, None)
+            found = state(client, "ready")
+            assert found["interrupted"] == ["monday"]
+            assert "table" in found["session"]["why"]
+            with Proxy(port, port=plug.port):
+                again = until(
+                    lambda: (
+                        (a := client.post(f"{BENCH}/sessions/resume", json={"name": "monday"})).status_code
+                        == 200
+                        and a
+                    )
+                )
+                assert again.json()["session"]["name"] == "monday"
+                state(client, "ready")
+                session = one.service.archive.session("monday")
+                assert session.status == "done"
+                good = [
+                    f.step for f in session.frames(kind="frame") if f.verdict is not None and f.verdict.ok
+                ]
+                assert sorted(good) == sorted(step for step, _ in STEPS)

@@ -17,6 +17,23 @@ Kind = Literal["grey values", "target coordinates", "temperature", "model", "rep
 class Contact(Strict):
     """A laboratory or a customer.
 
+    Parameters
+    ----------
+    name : str
+        Name.
+    city : str
+        City.
+    country : str
+        Code of its country, such as DE.
+    street : str, optional
+        Street.
+    post_code : str, optional
+        Post code.
+    email : str, optional
+        Address for mail.
+    code : str, optional
+        Number of its accreditation, or of the customer.
+
     Examples
     --------
     >>> Contact(name="Institute of Photogrammetry", city="Bonn", country="DE").city
@@ -35,6 +52,17 @@ class Contact(Strict):
 class Item(Strict):
     """What was calibrated.
 
+    Parameters
+    ----------
+    name : str
+        What it is, such as camera.
+    serial : str
+        Serial number.
+    manufacturer : str, optional
+        Manufacturer.
+    model : str, optional
+        Model.
+
     Examples
     --------
     >>> Item(name="camera", serial="4711").serial
@@ -50,6 +78,15 @@ class Item(Strict):
 class Reference(Strict):
     """The certificate of a standard.
 
+    Parameters
+    ----------
+    issuer : str
+        Who issued it.
+    id : str
+        Its number.
+    sha256 : str, optional
+        SHA-256 of its file.
+
     Examples
     --------
     >>> Reference(issuer="PTB", id="5.4-1234").issuer
@@ -63,6 +100,17 @@ class Reference(Strict):
 
 class Standard(Strict):
     """What the scale rests on: a bar, a ruler, control points.
+
+    Parameters
+    ----------
+    name : str
+        Name.
+    kind : str
+        What it is.
+    identification : str
+        Its inventory number.
+    certificate : Reference, optional
+        Its certificate.
 
     Examples
     --------
@@ -79,7 +127,18 @@ class Standard(Strict):
 class Temperature(Strict):
     """Temperature during the calibration, its standard uncertainty, and what it does to the parameters.
 
-    `coefficients` are changes of parameters per kelvin, in their units.
+    Parameters
+    ----------
+    celsius : float
+        Temperature (°C).
+    sigma : float
+        Its standard uncertainty (K).
+    coefficients : dict
+        Changes of parameters per kelvin, in their units.
+    degrees : float, optional
+        Degrees of freedom of the uncertainty.
+    distribution : str
+        Its distribution.
 
     Examples
     --------
@@ -96,6 +155,21 @@ class Temperature(Strict):
 
 class Stated(Strict):
     """A further contribution: standard uncertainty of an input, and changes of parameters by it.
+
+    Parameters
+    ----------
+    name : str
+        Name.
+    kind : str
+        What it is about.
+    sigma : float
+        Its standard uncertainty.
+    sensitivities : dict
+        Changes of parameters by a unit of it.
+    degrees : float, optional
+        Degrees of freedom of the uncertainty.
+    distribution : str
+        Its distribution.
 
     Examples
     --------
@@ -114,8 +188,32 @@ class Stated(Strict):
 class CertificateData(Document):
     """What a certificate says beyond the calibration, ``reseau-certificate-data/1``.
 
-    `identifier` is by default made of the calibration and the date; `begin` and `end` of the calibration are
-    by default those of its session.
+    Parameters
+    ----------
+    laboratory : Contact
+        Laboratory.
+    customer : Contact
+        Customer.
+    responsible : tuple of str
+        Persons who are responsible for it.
+    item : Item
+        What was calibrated.
+    location : str
+        Where it was calibrated.
+    standards : tuple of Standard
+        What the scale rests on.
+    temperature : Temperature, optional
+        Temperature during the calibration.
+    contributions : tuple of Stated
+        Further contributions to the uncertainty.
+    remarks : tuple of str
+        Remarks.
+    identifier : str, optional
+        Number of the certificate; by default made of the calibration and the date.
+    begin : date, optional
+        First day of the calibration; by default that of its session.
+    end : date, optional
+        Last day of the calibration; by default that of its session.
 
     Examples
     --------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -80,12 +79,12 @@ def form_of(
     ['rules.version', 'rules.image']
     """
     schema = model.model_json_schema()
-    return _fields(schema, schema, _described(model), dict(values or {}), prefix, True, but)
+    return _fields(schema, schema, dict(values or {}), prefix, True, but)
 
 
-def _described(model: type[BaseModel]) -> dict[str, str]:
-    """The first sentence about each parameter of a class."""
-    found = _PARAMETERS.search(inspect.getdoc(model) or "")
+def _described(text: str) -> dict[str, str]:
+    """The first sentence about each parameter of a class, by the description that its schema has."""
+    found = _PARAMETERS.search(text)
     said = dict[str, str]()
     for names, text in _ENTRY.findall("" if found is None else found[1] + "\n"):
         sentence = " ".join(text.split()).replace("`", "")
@@ -94,9 +93,10 @@ def _described(model: type[BaseModel]) -> dict[str, str]:
 
 
 def _fields(
-    schema: Mapping[str, Any], whole: Mapping[str, Any], said: Mapping[str, str], values: Mapping[str, Any],
-    prefix: str, required: bool, but: tuple[str, ...] = (),
+    schema: Mapping[str, Any], whole: Mapping[str, Any], values: Mapping[str, Any], prefix: str,
+    required: bool, but: tuple[str, ...] = (),
 ) -> tuple[FormField, ...]:  # fmt: skip
+    said = _described(schema.get("description", ""))
     needed = schema.get("required", ()) if required else ()
     return tuple(
         _field(
@@ -118,7 +118,7 @@ def _field(
         choices = tuple(map(str, found["enum"]))
         return FormField(name, label, "choice", required, value, choices)
     if kind == "object" and "properties" in found:
-        parts = _fields(found, whole, {}, value or {}, f"{name}.", required)
+        parts = _fields(found, whole, value or {}, f"{name}.", required)
         return FormField(name, label, "group", required, parts=parts)
     if kind == "object":
         return FormField(
@@ -129,7 +129,7 @@ def _field(
         if "properties" not in one:
             return FormField(name, label, "lines", required, "\n".join(map(str, value or ())))
         filled = [*(value or ()), {}]
-        groups = [_fields(one, whole, {}, each, f"{name}.{k}.", False) for k, each in enumerate(filled)]
+        groups = [_fields(one, whole, each, f"{name}.{k}.", False) for k, each in enumerate(filled)]
         return FormField(name, label, "group", parts=tuple(part for group in groups for part in group))
     if kind in ("number", "integer"):
         least = found.get("minimum", found.get("exclusiveMinimum"))
