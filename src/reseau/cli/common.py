@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -46,6 +47,24 @@ class Place:
         from ..archive import Archive
 
         return Archive.open(self.archive, self.objects, create=create)
+
+
+def for_systemd(template: str, archive: str, benches: Sequence[Path] = ()) -> str:
+    """Return a unit of systemd with the program, archive and benches of its place.
+
+    Raises
+    ------
+    UsageError
+        If a name has characters with a meaning for systemd.
+    """
+    if any(character in each for each in (archive, *map(str, benches)) for character in ' "%\n'):
+        where = "--archive, --bench" if benches else "--archive"
+        raise UsageError("contains characters with a meaning for systemd", where=where)
+    return template.format(
+        program=shutil.which("reseau") or "/usr/local/bin/reseau", where=Path.cwd(),
+        archive=archive if "://" in archive else str(Path(archive).absolute()),
+        more="".join(f" --bench {each.absolute()}" for each in benches),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

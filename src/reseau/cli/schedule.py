@@ -17,7 +17,7 @@ from ..core.errors import ReseauError, UsageError
 from ..core.files import writable
 from ..core.options import Option
 from .calibrations import say_decision, time_of
-from .common import Place, say, say_json
+from .common import Place, for_systemd, say, say_json
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ def run_(
 
 
 _SERVICE = """\
-# {folder}/reseau-schedule.service: carries out the recalibrations that are due.
+# /etc/systemd/system/reseau-schedule.service: carries out the recalibrations that are due.
 [Unit]
 Description=Recalibrations that are due
 After=network.target
@@ -162,7 +162,7 @@ Type=oneshot
 WorkingDirectory={where}
 ExecStart={program} schedule run --once --archive {archive}
 
-# {folder}/reseau-schedule.timer
+# /etc/systemd/system/reseau-schedule.timer
 [Unit]
 Description=Look for recalibrations that are due
 
@@ -178,13 +178,7 @@ WantedBy=timers.target
 @app.command()
 def units(archive: v.Archive = "archive") -> None:
     """Print a service and a timer for systemd."""
-    import shutil
-
-    if any(each in archive for each in ' "%\n'):
-        raise UsageError("contains characters with a meaning for systemd", where="--archive")
-    program = shutil.which("reseau") or "/usr/local/bin/reseau"
-    place = archive if "://" in archive else str(Path(archive).absolute())
-    say(_SERVICE.format(folder="/etc/systemd/system", where=Path.cwd(), program=program, archive=place))
+    say(for_systemd(_SERVICE, archive))
 
 
 def recalibrate(

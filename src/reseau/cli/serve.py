@@ -13,7 +13,7 @@ from ..core import vocabulary as v
 from ..core.errors import UsageError
 from ..core.files import writable
 from ..core.options import Option
-from .common import Place, say, say_json
+from .common import Place, for_systemd, say, say_json
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -31,9 +31,10 @@ app.add_typer(token_app, name="token")
 
 
 @dataclass(frozen=True)
-class Stated(Place):
-    """An archive with the accounts and keys of a service beside it."""
+class Beside:
+    """What a service keeps beside its archive."""
 
+    archive: v.Archive = "archive"
     state: v.State | None = None
 
     @property
@@ -45,19 +46,28 @@ class Stated(Place):
 
 
 @dataclass(frozen=True)
-class Registered:
+class Stated(Place):
+    """An archive with the accounts and keys of a service beside it."""
+
+    state: v.State | None = None
+
+    @property
+    def folder(self) -> StateFolder:
+        """The folder of accounts and keys."""
+        return Beside(self.archive, self.state).folder
+
+
+@dataclass(frozen=True)
+class Registered(Beside):
     """The accounts of a service."""
 
-    archive: v.Archive = "archive"
-    state: v.State | None = None
     accounts: v.Accounts | None = None
 
     def open(self, **options: Any) -> Accounts:
         """Open the accounts."""
         from ..service.accounts import Accounts
 
-        place = self.accounts or Stated(self.archive, None, self.state).folder.path("accounts.sqlite")
-        return Accounts(place, **options)
+        return Accounts(self.accounts or self.folder.path("accounts.sqlite"), **options)
 
 
 def serve(
@@ -154,8 +164,7 @@ def worker(
 def worker_certificate(
     address: Annotated[str, typer.Argument(help="Address of the other machine, such as 192.0.2.5.")],
     out: Annotated[v.Out, "Here a folder, for the other machine."],
-    archive: v.Archive = "archive",
-    state: v.State | None = None,
+    kept: Beside,
 ) -> None:
     """Make the certificate of a worker on another machine; copy its folder there, and keep it secret."""
     from ..core.optional import optional
@@ -163,16 +172,12 @@ def worker_certificate(
     with optional():
         from ..service.wire import Certificates
 
-    Certificates(Stated(archive, None, state).folder).export(address, out)
+    Certificates(kept.folder).export(address, out)
     say(f"{out}: for `reseau service worker --certificates` on {address}\n")
 
 
 @app.command()
-def link(
-    port: v.Port = 8480,
-    archive: v.Archive = "archive",
-    state: v.State | None = None,
-) -> None:
+def link(kept: Beside, port: v.Port = 8480) -> None:
     """Print an address that lets a browser of this machine in, once."""
     from ..core.errors import InputError
     from ..core.optional import optional
@@ -180,7 +185,7 @@ def link(
     with optional():
         import httpx
     origin = f"http://127.0.0.1:{port}"
-    headers = {"Authorization": f"Bearer {Stated(archive, None, state).folder.local_token()}"}
+    headers = {"Authorization": f"Bearer {kept.folder.local_token()}"}
     try:
         answer = httpx.post(f"{origin}/api/1/entries", headers=headers, timeout=10.0)
     except httpx.HTTPError as error:
@@ -309,30 +314,22 @@ def revoke_token(
 
 
 @app.command()
-def backup(
-    out: Annotated[Path, typer.Argument(help="Folder to write; new or empty.")],
-    archive: v.Archive = "archive",
-    state: v.State | None = None,
-) -> None:
+def backup(out: Annotated[Path, typer.Argument(help="Folder to write; new or empty.")], kept: Beside) -> None:
     """Copy archive, accounts and keys of a service that may be running; the copy is verified."""
     from ..service.upkeep import backup as made
 
-    counted = made(Path(archive), Stated(archive, None, state).folder.folder, out)
+    counted = made(Path(kept.archive), kept.folder.folder, out)
     say(f"{out}: {counted.sessions} sessions, {counted.files} files, accounts and keys\n")
 
 
 @app.command()
-def restore(
-    source: Annotated[Path, typer.Argument(help="Folder of a backup.")],
-    archive: v.Archive = "archive",
-    state: v.State | None = None,
-) -> None:
+def restore(source: Annotated[Path, typer.Argument(help="Folder of a backup.")], kept: Beside) -> None:
     """Restore a backup to a new archive; it is verified first."""
     from ..service.upkeep import restore as made
     from ..service.upkeep import state_beside
 
-    counted = made(source, Path(archive), state or state_beside(Path(archive)))
-    say(f"{archive}: {counted.sessions} sessions, {counted.files} files, accounts and keys\n")
+    counted = made(source, Path(kept.archive), kept.state or state_beside(Path(kept.archive)))
+    say(f"{kept.archive}: {counted.sessions} sessions, {counted.files} files, accounts and keys\n")
 
 
 @app.command()
@@ -383,15 +380,7 @@ def unit(
     archive: v.Archive = "archive", bench: Annotated[list[v.Bench] | None, "Repeatable."] = None
 ) -> None:
     """Print a unit of systemd for the service."""
-    import shutil
-
-    places = [archive, *(str(each) for each in bench or [])]
-    if any(character in each for each in places for character in ' "%\n'):
-        raise UsageError("contains characters with a meaning for systemd", where=", ".join(places))
-    program = shutil.which("reseau") or "/usr/local/bin/reseau"
-    place = archive if "://" in archive else str(Path(archive).absolute())
-    more = "".join(f" --bench {each.absolute()}" for each in bench or [])
-    say(_UNIT.format(program=program, archive=place, more=more, where=Path.cwd()))
+    say(for_systemd(_UNIT, archive, bench or ()))
 
 
 @audit_app.command()

@@ -172,7 +172,7 @@ class Configurations:
 
     def reference(self, name: str) -> str | None:
         """Return the key of the reference since the last service event: one that was set, or the first."""
-        start = max((time for time, _ in self.events(name)), default=datetime.min.replace(tzinfo=UTC))
+        start = self._begin(name)
         own = [each for each in self.history(name) if each.outcome in _ACCEPTED and each.since >= start]
         keys = {each.key for each in own}
         given = [e.document["key"] for e in self._entries(name, "reference") if e.document["key"] in keys]
@@ -413,7 +413,7 @@ class Configurations:
 
         None are returned for a decision from before that event.
         """
-        start = max((time for time, _ in self.events(name)), default=datetime.min.replace(tzinfo=UTC))
+        start = self._begin(name)
         keys = [
             each.key
             for each in self.history(name)
@@ -499,8 +499,7 @@ class Configurations:
 
         Cameras of other models are converted to that of the last one; with the largest error of it, px.
         """
-        events = self.events(name)
-        start = events[-1][0] if events else datetime.min.replace(tzinfo=UTC)
+        start = self._begin(name)
         decisions = [d for d in self.history(name) if d.outcome != "rejected" and d.since >= start]
         decisions.sort(key=lambda d: (d.since, d.at))
         if not decisions:
@@ -513,6 +512,10 @@ class Configurations:
                 found[k], error = in_model_of(each, last)
                 errors.append(error)
         return keys, [*found, last], max(errors)
+
+    def _begin(self, name: str) -> datetime:
+        """Time of the last service event, or before all times."""
+        return max((time for time, _ in self.events(name)), default=datetime.min.replace(tzinfo=UTC))
 
     def _journal(self, name: str) -> Journal:
         return self._archive.journal(_PREFIX + name)

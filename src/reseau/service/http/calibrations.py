@@ -280,29 +280,24 @@ def decision_row(decision: Decision) -> DecisionRow:
     )
 
 
-def _in_force(service: Service, known: Configurations, name: str, now: datetime) -> InForce | None:
-    applied = known.applied(name, now)
-    if applied is None:
-        return None
-    row = decision_row(known.decision(name, applied.key))
-    return InForce(key=applied.key, name=row.name, since=applied.since.isoformat(), why=applied.why)
+def _row(service: Service, known: Configurations, name: str, history: list[Decision]) -> dict[str, Any]:
+    """What a list shows of a configuration."""
+    applied, in_force = known.applied(name, service.archive.clock()), None
+    if applied is not None:
+        row = decision_row(known.decision(name, applied.key))
+        in_force = InForce(key=applied.key, name=row.name, since=applied.since.isoformat(), why=applied.why)
+    return {
+        "name": name, "parts": known.parts(name), "in_force": in_force, "decisions": len(history),
+        "to_review": sum(each.outcome == "needs review" for each in history),
+    }  # fmt: skip
 
 
 def listed(service: Service) -> list[ConfigurationRow]:
     """Return all configurations."""
 
     def compute() -> list[ConfigurationRow]:
-        known, now = known_configurations(service), service.archive.clock()
-        found = []
-        for name in known.names():
-            history = known.history(name)
-            found.append(
-                ConfigurationRow(
-                    name=name, parts=known.parts(name), in_force=_in_force(service, known, name, now),
-                    decisions=len(history), to_review=sum(d.outcome == "needs review" for d in history),
-                )
-            )  # fmt: skip
-        return found
+        known = known_configurations(service)
+        return [ConfigurationRow(**_row(service, known, name, known.history(name))) for name in known.names()]
 
     return service.current("configurations", compute)
 
@@ -312,9 +307,7 @@ def configuration_detail(service: Service, name: str) -> ConfigurationDetail:
     known = the_configuration(service, name)
     history = known.history(name)
     return ConfigurationDetail(
-        name=name, parts=known.parts(name), in_force=_in_force(service, known, name, service.archive.clock()),
-        decisions=len(history), to_review=sum(d.outcome == "needs review" for d in history),
-        history=[decision_row(each) for each in reversed(history)],
+        **_row(service, known, name, history), history=[decision_row(each) for each in reversed(history)],
         events=[EventRow(at=at.isoformat(), what=what) for at, what in known.events(name)],
     )  # fmt: skip
 
