@@ -325,8 +325,8 @@ def backup(out: Annotated[Path, typer.Argument(help="Folder to write; new or emp
 @app.command()
 def restore(source: Annotated[Path, typer.Argument(help="Folder of a backup.")], kept: Beside) -> None:
     """Restore a backup to a new archive; it is verified first."""
+    from ..service.state import state_beside
     from ..service.upkeep import restore as made
-    from ..service.upkeep import state_beside
 
     counted = made(source, Path(kept.archive), kept.state or state_beside(Path(kept.archive)))
     say(f"{kept.archive}: {counted.sessions} sessions, {counted.files} files, accounts and keys\n")

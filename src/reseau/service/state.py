@@ -11,6 +11,18 @@ from ..core.errors import InputError, UsageError
 _LOCAL, _TOKEN = "local-token", 32
 
 
+def state_beside(archive: Path) -> Path:
+    """Return the state folder that belongs to an archive, which need not exist.
+
+    Examples
+    --------
+    >>> state_beside(Path("/srv/archive"))
+    PosixPath('/srv/archive-service')
+    """
+    place = archive.absolute()
+    return place.with_name(f"{place.name}-service")
+
+
 class StateFolder:
     """The folder in which the service keeps what must not be in the archive.
 
@@ -58,8 +70,7 @@ class StateFolder:
             return cls(given)
         if "://" in archive:
             raise UsageError("is missing", where="--state", do="name a folder for accounts and keys")
-        place = Path(archive).absolute()
-        return cls(place.with_name(f"{place.name}-service"))
+        return cls(state_beside(Path(archive)))
 
     def path(self, name: str) -> Path:
         """Return the path of a file of the folder."""

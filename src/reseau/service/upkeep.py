@@ -32,18 +32,6 @@ class Counted:
     files: int
 
 
-def state_beside(archive: Path) -> Path:
-    """Return the state folder that belongs to an archive, which need not exist.
-
-    Examples
-    --------
-    >>> state_beside(Path("/srv/archive"))
-    PosixPath('/srv/archive-service')
-    """
-    place = archive.absolute()
-    return place.with_name(f"{place.name}-service")
-
-
 def backup(archive: Path, state: Path, out: Path) -> Counted:
     """Copy the archive and the state of a service to a new folder, and verify the copy.
 

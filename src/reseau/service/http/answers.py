@@ -117,14 +117,21 @@ def add_error_handlers(app: FastAPI, page: Callable[[Request, int, str], Respons
         Renders a page that says what is wrong.
     """
 
-    def shown(request: Request, status: int, text: str) -> Response:
+    def answered(
+        request: Request, status: int, code: str, text: str, what: str = "", where: str | None = None,
+        do: str | None = None, headers: dict[str, str] | None = None,
+    ) -> Response:  # fmt: skip
+        detail = ErrorDetail(code=code, text=text, what=what or text, where=where, do=do)
+        plain = JSONResponse(ErrorAnswer(error=detail).model_dump(), status, headers)
+        if request.url.path.startswith("/api/"):
+            return plain
         if status == 401:
             target = request.url.path if request.method == "GET" else "/"
             return RedirectResponse(f"/login?next={target}", 303)
         try:
             return page(request, status, text)
         except ReseauError:  # such as accounts that cannot be read, which every page asks for
-            return _error(status, "error", text, text, None, None, {})
+            return plain
 
     @app.exception_handler(ReseauError)
     def known(request: Request, error: ReseauError) -> Response:
@@ -135,37 +142,22 @@ def add_error_handlers(app: FastAPI, page: Callable[[Request, int, str], Respons
         if status == 401:
             headers["WWW-Authenticate"] = "Bearer"
         where = None if error.where is None else str(error.where)
-        if not request.url.path.startswith("/api/"):
-            return shown(request, status, str(error))
-        return _error(status, code, str(error), error.what, where, error.do, headers)
+        return answered(request, status, code, str(error), error.what, where, error.do, headers)
 
     @app.exception_handler(RequestValidationError)
     def invalid(request: Request, error: RequestValidationError) -> Response:
         first = error.errors()[0]
         where = ".".join(str(each) for each in first["loc"] if each not in ("body", "query", "path"))
-        if not request.url.path.startswith("/api/"):
-            return shown(request, 422, f"{where}: {first['msg']}")
-        return _error(422, "usage", f"{where}: {first['msg']}", first["msg"], where or None, None, {})
+        return answered(request, 422, "usage", f"{where}: {first['msg']}", first["msg"], where or None)
 
     @app.exception_handler(HTTPException)
     def http(request: Request, error: HTTPException) -> Response:
-        text = str(error.detail)
-        if not request.url.path.startswith("/api/"):
-            return shown(request, error.status_code, text)
         code = {404: "not_found", 405: "method"}.get(error.status_code, "request")
-        return _error(error.status_code, code, text, text, None, None, dict(error.headers or {}))
+        headers = dict(error.headers or {})
+        return answered(request, error.status_code, code, str(error.detail), headers=headers)
 
     @app.exception_handler(Exception)
     def unexpected(request: Request, error: Exception) -> Response:
         log("error", path=request.url.path, kind=type(error).__name__, request=request.state.request)
         text = f"the service failed; its log has more under {request.state.request}"
-        if not request.url.path.startswith("/api/"):
-            return shown(request, 500, text)
-        return _error(500, "error", text, text, None, None, {})
-
-
-def _error(
-    status: int, code: str, text: str, what: str, where: str | None, do: str | None, headers: dict[str, str]
-) -> JSONResponse:
-    detail = ErrorDetail(code=code, text=text, what=what, where=where, do=do)
-    return JSONResponse(ErrorAnswer(error=detail).model_dump(), status, headers)
+        return answered(request, 500, "error", text)
