@@ -19,12 +19,12 @@ from typing import Any
 from ..capture.bench import BenchFile
 from ..core.errors import ConnectionLost, DeadlineError, ReseauError, StateError
 from ..io import read_text
+from .orders import BUSY
 from .state import StateFolder
 from .wire import Certificates, Wire, checked_peer, error_of
 from .worker import address_file
 
 _START_S, _PAUSE_S, _LONGEST_PAUSE_S, _END_S = 60.0, 0.1, 10.0, 5.0
-_BUSY = ("running", "pausing", "paused", "asking", "ending")
 _MOST_WAITING = 4
 """Commands of a bench that wait for one another; further ones are refused."""
 
@@ -91,7 +91,7 @@ class BenchLink:
             self._wire.close()
         self._thread.join(5)
         end = time.monotonic() + _END_S
-        busy = self._status.get("state") in _BUSY
+        busy = self._status.get("state") in BUSY
         while not self._ended() and not busy and time.monotonic() < end:
             time.sleep(0.02)
 

@@ -21,6 +21,8 @@ _PREFIX = "orders/"
 What = Literal["recalibration", "session"]
 OrderState = Literal["waiting", "running", "blocked", "done", "failed", "withdrawn"]
 OVER: frozenset[OrderState] = frozenset({"done", "failed", "withdrawn"})
+BUSY = ("running", "pausing", "paused", "asking", "ending")
+"""States of a bench with a session."""
 _FIRST_PAUSE, _TRIES = timedelta(seconds=30), 6
 
 

@@ -375,10 +375,11 @@ class Worker:
             if self._moving:
                 threading.Thread(target=self._insist, args=(self._stops,), daemon=True).start()
             self._say("stopped", {"ms": round(1e3 * spent, 1)})
-            return True, {"ms": round(1e3 * spent, 1), **self.status()}, b""
-        if what == "status":  # in its turn among the events, so that none that is older follows it
+            return True, {"ms": round(1e3 * spent, 1)}, b""
+        if what == "status":  # as an event among the others: none that is older follows it
             self._say("status")
-        asked = {"status": self.status, "bench": lambda: self.text, "settings": self._settings}.get(str(what))
+            return True, {}, b""
+        asked = {"bench": lambda: self.text, "settings": self._settings}.get(str(what))
         if asked is not None:
             return True, asked(), b""
         if what == "axes" and self._moving and self._places:

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from ...core.options import values_of_texts
 from ..accounts import Principal
+from ..orders import BUSY
 from .access import Here, NotFound, Operating, Reading, operating
 from .answers import Answer, refusals
 from .guard import ARRIVED
@@ -175,17 +176,12 @@ def the_bench(service: Service, name: str) -> BenchLink:
 
 def bench_answer(service: Service, link: BenchLink) -> BenchAnswer:
     """Return the state of a bench."""
-    status = dict(link.status)
-    for key in ("pid",):
-        status.pop(key, None)
-    running = status["session"]["name"] if status["state"] in _BUSY and status["session"] else None
+    status = {key: value for key, value in link.status.items() if key != "pid"}
+    running = status["session"]["name"] if status["state"] in BUSY and status["session"] else None
     return BenchAnswer(
         **status, restarts=max(link.restarts, 0),
         interrupted=[each for each in _interrupted(service, link) if each != running],
     )  # fmt: skip
-
-
-_BUSY = ("running", "pausing", "paused", "asking", "ending")
 
 
 def _interrupted(service: Service, link: BenchLink) -> list[str]:
@@ -208,6 +204,23 @@ def _asked(
     facts = {k: v for k, v in (given or {}).items() if k not in ("inputs", "parameters", "by")}
     with service.audited(who, action, f"bench {name}", facts):
         return link.request(do, given, seconds, ARRIVED.get())
+
+
+def _after(service: Service, name: str, *asked: Any, **options: Any) -> BenchAnswer:
+    """As `_asked`; return the state of the bench then."""
+    _asked(service, name, *asked, **options)
+    return bench_answer(service, the_bench(service, name))
+
+
+def order_of(service: Service, bench: str, given: NewSession) -> dict[str, Any]:
+    """Return what a bench is asked to do for a new session; raises UsageError if there is one of its name."""
+    from ...sessions.kinds import kind_of
+
+    the_bench(service, bench)
+    new_name(service, given.name)
+    order = given.model_dump(exclude={"texts"})
+    order["parameters"] |= values_of_texts(kind_of(given.plan).parameters, given.texts, given.name)
+    return order
 
 
 @router.get("/benches")
@@ -285,66 +298,51 @@ def check(bench: BenchName, who: Operating, service: Here) -> list[Tested]:
 @router.post("/benches/{bench}/take")
 def take(bench: BenchName, who: Operating, service: Here) -> BenchAnswer:
     """Lock and connect the instruments."""
-    _asked(service, bench, who, "take", "take", None, 60.0)
-    return bench_answer(service, the_bench(service, bench))
+    return _after(service, bench, who, "take", "take", seconds=60.0)
 
 
 @router.post("/benches/{bench}/release")
 def release(bench: BenchName, who: Operating, service: Here) -> BenchAnswer:
     """Disconnect and release the instruments, for other programs."""
-    _asked(service, bench, who, "release", "release", None, 60.0)
-    return bench_answer(service, the_bench(service, bench))
+    return _after(service, bench, who, "release", "release", seconds=60.0)
 
 
 @router.post("/benches/{bench}/sessions", status_code=201)
 def begin(bench: BenchName, given: NewSession, who: Operating, service: Here) -> BenchAnswer:
     """Begin a session on a bench, with a plan."""
-    from ...sessions.kinds import kind_of
-
-    the_bench(service, bench)
-    new_name(service, given.name)
-    order = given.model_dump(exclude={"texts"}) | {"by": who.name}
-    order["parameters"] |= values_of_texts(kind_of(given.plan).parameters, given.texts, given.name)
-    _asked(service, bench, who, "begin session", "begin", order, 60.0)
-    return bench_answer(service, the_bench(service, bench))
+    order = order_of(service, bench, given) | {"by": who.name}
+    return _after(service, bench, who, "begin session", "begin", order, 60.0)
 
 
 @router.post("/benches/{bench}/sessions/resume")
 def resume_session(bench: BenchName, given: Resumed, who: Operating, service: Here) -> BenchAnswer:
     """Resume a session that was interrupted or aborted; poses that have a good frame are not repeated."""
-    _asked(
-        service, bench, who, "resume session", "resume_session", {"name": given.name, "by": who.name}, 60.0
-    )
-    return bench_answer(service, the_bench(service, bench))
-
-
-def _steer(service: Service, bench: str, who: Principal, action: str) -> BenchAnswer:
-    _asked(service, bench, who, f"{action} session", action)
-    return bench_answer(service, the_bench(service, bench))
+    order = {"name": given.name, "by": who.name}
+    return _after(service, bench, who, "resume session", "resume_session", order, 60.0)
 
 
 @router.post("/benches/{bench}/pause")
 def pause(bench: BenchName, who: Operating, service: Here) -> BenchAnswer:
     """Pause the session after the present pose."""
-    return _steer(service, bench, who, "pause")
+    return _after(service, bench, who, "pause session", "pause")
 
 
 @router.post("/benches/{bench}/resume")
 def resume(bench: BenchName, who: Operating, service: Here) -> BenchAnswer:
     """Let a session that is paused go on."""
-    return _steer(service, bench, who, "continue")
+    return _after(service, bench, who, "continue session", "continue")
 
 
 @router.post("/benches/{bench}/abort")
 def abort(bench: BenchName, who: Operating, service: Here) -> BenchAnswer:
     """End the session at once; it can be resumed later."""
-    return _steer(service, bench, who, "abort")
+    return _after(service, bench, who, "abort session", "abort")
 
 
 @router.post("/benches/{bench}/answer")
 def answer(bench: BenchName, who: Operating, service: Here) -> BenchAnswer:
     """Say that what the session asks for is done."""
-    return _steer(service, bench, who, "answer")
+    return _after(service, bench, who, "answer session", "answer")
 
 
 @router.get("/benches/{bench}/picture")

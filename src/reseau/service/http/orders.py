@@ -12,9 +12,8 @@ from ..accounts import Principal
 from ..orders import Order, Orders
 from .access import Administering, Here, Operating, Reading
 from .answers import Answer, Done, Instant, refusals
-from .benches import BenchName, NewSession, the_bench
+from .benches import BenchName, NewSession, order_of, the_bench
 from .service import Service
-from .sessions import new_name
 
 router = APIRouter(tags=["benches"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
 
@@ -171,13 +170,7 @@ def recalibrate(bench: BenchName, given: NewRecalibration, who: Operating, servi
 @router.post("/benches/{bench}/orders/sessions", status_code=201)
 def session_later(bench: BenchName, given: NewSession, who: Operating, service: Here) -> OrderRow:
     """Have a session carried out as soon as its turn comes."""
-    from ...core.options import values_of_texts
-    from ...sessions.kinds import kind_of
-
-    new_name(service, given.name)
-    wanted = given.model_dump(exclude={"texts"})
-    wanted["parameters"] |= values_of_texts(kind_of(given.plan).parameters, given.texts, given.name)
-    return _asked(service, bench, who, "session", wanted)
+    return _asked(service, bench, who, "session", order_of(service, bench, given))
 
 
 @router.post("/benches/{bench}/orders/pause")

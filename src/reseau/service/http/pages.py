@@ -19,6 +19,7 @@ from ...core.errors import ReseauError
 from ...core.options import Declared, Group, options_of
 from ...core.vocabulary import names
 from ...io.photographs import PHOTOGRAPHS
+from ..orders import BUSY
 from . import accounts, benches, calibrations, comparisons, history, operations, orders, sessions
 from .access import Administering, Here, NotFound, Reading, Unknown, csrf_of, principal_of, service_of
 from .forms import FormField, form_of
@@ -43,7 +44,6 @@ NAV = (
     ("/history", "History"),
     ("/account", "Account"),
 )
-_BUSY = ("running", "pausing", "paused", "asking", "ending")
 _SHOWN = 400
 """Frames on the page of a session."""
 _RULES = {"version": 1, "image": {"warning": 0.1, "action": 0.3}}
@@ -180,7 +180,7 @@ def _first_steps(
 def _card(found: benches.BenchAnswer) -> dict[str, str]:
     """A bench in a line."""
     text = found.error or found.moving or ("its worker starts" if found.state == "starting" else "idle")
-    if found.session is not None and found.state in _BUSY:
+    if found.session is not None and found.state in BUSY:
         text = f"{found.session.name}: {found.session.good}"
         text += "" if found.session.expected is None else f" of {found.session.expected} poses"
     return {"name": found.name, "state": found.state, "text": text}
@@ -210,7 +210,7 @@ def bench_page(request: Request, bench: str, who: Reading, service: Here) -> Res
             axes = benches.axes(bench, who, service) if found.has_table else {}
         except ReseauError:  # the worker ended meanwhile; the next event shows it
             pass
-    busy = found.session is not None and found.state in _BUSY
+    busy = found.session is not None and found.state in BUSY
     return _rendered(
         request,
         "bench.html.j2",
@@ -272,7 +272,7 @@ def session_page(request: Request, session: str, who: Reading, service: Here) ->
     found = sessions.session_detail(service, kept)
     frames = sessions.latest_frames(kept, _SHOWN)
     every = [benches.bench_answer(service, each) for each in service.benches.values()]
-    mine = [b for b in every if b.session is not None and b.session.name == session and b.state in _BUSY]
+    mine = [b for b in every if b.session is not None and b.session.name == session and b.state in BUSY]
     running = mine[0] if mine else None
     return _rendered(
         request, "session.html.j2", s=found, frames=frames[::-1], shown=_SHOWN,
