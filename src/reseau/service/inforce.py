@@ -187,9 +187,7 @@ class Configurations:
         UsageError
             If it was not accepted, or no reason is given.
         """
-        decision = self.decision(name, key)
-        if decision.outcome not in _ACCEPTED:
-            raise UsageError(f"was not accepted ({decision.outcome})", where=key)
+        decision = self._accepted(name, key)
         if not comment.strip():
             raise UsageError("needs a reason", where=f"reference {key}", do="give a comment")
         document = {"key": decision.key, "by": by or _user(), "comment": comment}
@@ -298,9 +296,7 @@ class Configurations:
         UsageError
             If that calibration was not accepted.
         """
-        decision = self.decision(name, key)
-        if decision.outcome not in _ACCEPTED:
-            raise UsageError(f"was not accepted ({decision.outcome})", where=key)
+        decision = self._accepted(name, key)
         start = a_time(since or self._archive.clock())
         document = {"key": decision.key, "since": start.isoformat(), "by": by or _user(), "comment": comment}
         self._journal(name).add("return", document)
@@ -335,6 +331,13 @@ class Configurations:
         if len(found) != 1:
             raise UsageError(f"names {len(found)} decisions", where=f"{name}: {key!r}", do="see its history")
         return found[0]
+
+    def _accepted(self, name: str, key: str) -> Decision:
+        """A decision, if it was accepted."""
+        decision = self.decision(name, key)
+        if decision.outcome not in _ACCEPTED:
+            raise UsageError(f"was not accepted ({decision.outcome})", where=key)
+        return decision
 
     def history(self, name: str) -> list[Decision]:
         """Return all decisions in the order in which they were made."""

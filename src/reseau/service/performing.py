@@ -185,7 +185,7 @@ class Performer:
             bench=lambda file: self._holder.required(),
             using=lambda bench, archive, session: self._lock(session), capture=capture, wait=self._wait,
         )  # fmt: skip
-        return f"{found.decision.outcome}: {found.decision.key}"
+        return f"{found.outcome}: {found.key}"
 
     def _acquired(self, order: Order, control: Control) -> str:
         """Carry out a session, or continue it; return its status."""

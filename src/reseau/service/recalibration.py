@@ -8,14 +8,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
 from ..archive import Archive, Session
-from ..calibration import Calibration
 from ..capture import Bench, BenchFile
 from ..capture.judging import Watch
 from ..core.errors import InstrumentError, UsageError
@@ -94,30 +92,6 @@ class Recalibration(Document):
     certificate: dict[str, Any] | None = None
     notify: tuple[str, ...] = ()
     inside: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Recalibrated:
-    """A recalibration that was carried out.
-
-    Parameters
-    ----------
-    session : str
-        Name of its session.
-    calibration : Calibration
-        The new calibration.
-    decision : Decision
-        The decision on it.
-
-    Examples
-    --------
-    >>> list(Recalibrated.__dataclass_fields__)
-    ['session', 'calibration', 'decision']
-    """
-
-    session: str
-    calibration: Calibration
-    decision: Decision
 
 
 class Recalibrations:
@@ -217,7 +191,7 @@ class Recalibrations:
         using: Using = locked,
         capture: Callable[..., Any] = conducting.capture,
         wait: Callable[[float], Any] = time.sleep,
-    ) -> Recalibrated:
+    ) -> Decision:
         """Carry out a recalibration, or continue it.
 
         Its steps: warm up, self-test, acquire, decide, certificate, notify; each is said to `watch`.
@@ -242,6 +216,11 @@ class Recalibrations:
         wait : callable
             Waits for some seconds while the instruments warm up.
 
+        Returns
+        -------
+        Decision
+            On the new calibration.
+
         Raises
         ------
         InstrumentError
@@ -259,9 +238,8 @@ class Recalibrations:
             instruments = bench(BenchFile.parse_toml(made.bench, where=f"bench of {name}"))
             found = self._carried_out(made, title, there, instruments, using, partial(capture, watch=watch),
                                       lambda: _prepared(made, instruments, watch, wait))  # fmt: skip
-        calibration, known = conducting.calibration_of(found), Configurations(self._archive)
-        decision = known.decide(
-            made.configuration, calibration, rules, since=found.begun, session=title,
+        decision = Configurations(self._archive).decide(
+            made.configuration, conducting.calibration_of(found), rules, since=found.begun, session=title,
             by=f"{by}, recalibration {name}" if by else f"recalibration {name}",
         )  # fmt: skip
         watch("step", {"text": f"decided: {decision.outcome} ({decision.key})"})
@@ -273,7 +251,7 @@ class Recalibrations:
             text = f"{made.configuration}: {title} {decision.outcome}{f' ({why})' if why else ''}"
             sent = sender(made.notify, made.inside)(f"reseau: {name} {decision.outcome}", text)
             watch("step", {"text": "notified" if sent else "could not be notified"})
-        return Recalibrated(title, calibration, decision)
+        return decision
 
     def carry_out(self, schedule: Schedule, run: Run, **options: Any) -> str:
         """Carry out a run of a schedule, or continue it: its session has the name of the run.
@@ -324,7 +302,7 @@ class Recalibrations:
         made = self.get(name)
         bench = BenchFile.parse_toml(made.bench, where=f"bench of {name}")
         if not held_by_service(bench):
-            return self.run(name, session, by=by, **options).decision
+            return self.run(name, session, by=by, **options)
         order = asked(self._archive, bench.name, "recalibration", {"name": name}, by, session, over)
         decided = Configurations(self._archive).history(made.configuration)
         return next(each for each in reversed(decided) if each.session == order.session)

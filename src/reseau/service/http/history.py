@@ -17,6 +17,7 @@ from .stored import picture_answer
 if TYPE_CHECKING:
     from ..covariates import CovariateTable
     from ..decisions import Drift
+    from ..schedule import Schedules
 
 
 router = APIRouter(tags=["history"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
@@ -330,14 +331,20 @@ def add_schedule(given: NewSchedule, who: Administering, service: Here) -> Done:
     return Done(done="added")
 
 
-@router.delete("/schedules/{name}")
-def remove_schedule(name: Name, who: Administering, service: Here) -> Done:
-    """Remove a schedule; its history stays."""
+def _the_schedule(service: Service, name: str) -> Schedules:
+    """The schedules of the archive, one of which has this name."""
     from ..schedule import Schedules
 
     known = Schedules(service.archive)
     if name not in known.names():
         raise NotFound("is not a schedule of this archive", where=name)
+    return known
+
+
+@router.delete("/schedules/{name}")
+def remove_schedule(name: Name, who: Administering, service: Here) -> Done:
+    """Remove a schedule; its history stays."""
+    known = _the_schedule(service, name)
     with service.audited(who, "remove schedule", name):
         known.remove(name)
     return Done(done="removed")
@@ -349,12 +356,7 @@ def remove_schedule(name: Name, who: Administering, service: Here) -> Done:
 )  # fmt: skip
 def calendar(name: Name, who: Reading, service: Here) -> Response:
     """The runs of a schedule as an iCalendar feed."""
-    from ..schedule import Schedules
-
-    known = Schedules(service.archive)
-    if name not in known.names():
-        raise NotFound("is not a schedule of this archive", where=name)
-    return Response(known.feed(name), media_type="text/calendar")
+    return Response(_the_schedule(service, name).feed(name), media_type="text/calendar")
 
 
 @router.get("/alarms")
