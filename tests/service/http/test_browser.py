@@ -238,7 +238,7 @@ def begin_session(place: Place, browser: Browser, name: str) -> None:
     poses.write_text("\n".join(("name,tilt,roll,camera_roll", *rows)) + "\n")
     chosen(browser, f"{form} [data-text='texts.steps']", poses)
     chosen(browser, f"{form} [data-input]", place.folder / "design.json")
-    browser.click("form[data-api$='/sessions'] button")
+    browser.click("form[data-api$='/sessions'] button.primary")
     browser.until(f"Session {name}")
 
 
@@ -515,3 +515,35 @@ def test_pages_stay_true_when_the_clock_is_set_back_and_forth(
         assert first.startswith("in the past")
         assert first.rstrip().endswith("done")
         assert Archive.open(place.folder / "archive").session("in the past").counts() == (4, 4)
+
+
+def test_poses_are_filled_in_row_by_row_and_axes_that_are_left_empty_do_not_move(
+    place: Place, browser: Browser
+) -> None:
+    enter(place, browser)
+    home(place)
+    browser.resize(1280, 844)
+    browser.open(f"http://127.0.0.1:{place.port}/benches/cellar")
+    hidden = "const i = document.querySelector('.picture img'); i.hidden = true;"
+    assert browser.run(f"{hidden} return getComputedStyle(i).display") == "none"  # while a camera starts
+    until(lambda: "deg" in browser.text("#axes-title ~ div"))
+    browser.fill("[name=name]", "by hand")
+    choose = "const plan = document.querySelector('[name=plan]'); plan.value = 'testfield';"
+    browser.run(f"{choose} plan.dispatchEvent(new Event('change'))")
+    form = "fieldset[data-for=testfield]"
+    for _ in range(3):
+        browser.click(f"{form} [data-add]")
+    browser.click(f"{form} [data-add=here]")
+    here = browser.run("return document.querySelector(arguments[0]).value",
+                       f"{form} tr:nth-child(4) [data-column=roll]")  # fmt: skip
+    assert float(here) == pytest.approx(1.234, abs=0.01)
+    browser.click(f"{form} tr:nth-child(4) [data-remove]")
+    for row, tilt in ((1, 0), (2, 10), (3, 20)):
+        written(browser, f"{form} tr:nth-child({row}) [data-column=tilt]", str(tilt))
+    chosen(browser, f"{form} [data-input]", place.folder / "design.json")
+    browser.click("form[data-api$='/sessions'] button.primary")
+    until(lambda: "Session by hand" in browser.text("#state"))
+    with Archive.open(place.folder / "archive") as archive:
+        steps = archive.session("by hand").parameters["steps"]
+    assert steps == [["pose 1", {"tilt": 0.0}], ["pose 2", {"tilt": 10.0}], ["pose 3", {"tilt": 20.0}]]
+    home(place)
