@@ -218,15 +218,20 @@ class _Job:
         self, done: Calibrated | Failure, measured: dict[str, ImagePoints], wrong: Misnamed | None
     ) -> Calibrated | Failure:
         """What was adjusted from the points; without gross errors where these explain what is left."""
-        if isinstance(done, Failure) or self.options.reject is not None:
+        if self.options.reject is not None:
             return done
-        causes = done.explanation.causes
-        if not causes or causes[0].code != "blunders":
+        if isinstance(done, Failure):
+            wrong_points = done.code is Code.NOT_CONVERGED
+        else:
+            wrong_points = [cause.code for cause in done.explanation.causes[:1]] == ["blunders"]
+        if not wrong_points:
             return done
         without = replace(self, options=replace(self.options, reject=True))._adjusted(measured, wrong)
         if isinstance(without, Failure):
             return done
         rows = np.flatnonzero(without.result.rejected)
+        if not len(rows):
+            return without
         said = _LEFT_OUT.format(len(rows), in_images(without.result.network, rows))
         return replace(without, notes=(*without.notes, said))
 

@@ -148,6 +148,12 @@ class Scores:
         seen = values > _ABSORBED * max(float(values[-1]), 0.0)
         return np.where(seen, values, 0.0), np.where(seen, (vectors.T @ self.g) ** 2, 0.0)
 
+    @property
+    def definite(self) -> bool:
+        """Whether the information is nowhere negative; otherwise more than half of its digits are lost."""
+        values = np.linalg.eigvalsh(self.m)
+        return bool(values[0] >= -np.sqrt(np.finfo(float).eps) * max(float(values[-1]), 0.0))
+
     def log_evidence(self, sizes: Array = _SIZES, *, known: float = 0.5) -> float:
         """Logarithm of the density of the observations with these effects, of unknown size.
 

@@ -9,7 +9,7 @@ best is taken into account, and what is left is looked at again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,7 +25,7 @@ from ..diagnostics.fields import camera_mapping
 from ..diagnostics.result import Result
 from .alternatives import alternatives
 from .discrete import Single, gross_errors, other_cameras
-from .effects import Family, Sight, families, lens_at
+from .effects import Family, Sight, creased, families, lens_at
 from .names import Misnamed
 from .sentences import advice, listed_places
 
@@ -311,11 +311,22 @@ def _compared(
         single = {one.code: one for one in others if one is not None}
         found |= {code: one.log_evidence - sound for code, one in single.items()}
     if discrete and max(found.values()) > -np.log(_FALSE) and max(found, key=found.__getitem__) != "noise":
-        for one in alternatives(sight.result, _KNOWN):
+        for one in (*alternatives(sight.result, _KNOWN), *_of_creases(sight)):
             if one.log_evidence - sound > found.get(one.code, -np.inf):
                 found[one.code] = one.log_evidence - sound
                 single[one.code] = one
     return _Comparison(found, forms, single)
+
+
+def _of_creases(sight: Sight) -> Iterator[Single]:
+    """Yield what differs over the target from image to image, which has many effects."""
+    for family in creased(sight):
+        if too_large(sight.result.fit, family.effect.count):
+            continue
+        forms = _forms(family, scores(sight.result.fit, [family.effect]), sight)
+        log = float(scipy.special.logsumexp([form.log_evidence for form in forms])) - np.log(len(forms))
+        best = max(forms, key=lambda form: form.log_evidence)
+        yield Single(best.code, best.name, log, best.scores.explained(best.size))
 
 
 def _nearer(forms: list[_Form], sight: Sight, whole: Scores) -> list[_Form]:
@@ -429,6 +440,8 @@ def _adjusted_with(form: _Form, sight: Sight) -> _Form:
         family = family.seen_again(seen)
         part = scores(again, [family.effect]).before(every)
         own = part.part(form.columns).scaled(units)
+        if not own.definite:
+            return best
         log = own.log_evidence(known=_KNOWN)
         if log > best.log_evidence:
             best = replace(form, family=family, log_evidence=log, adjusted=(seen, part, every))
