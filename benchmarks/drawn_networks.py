@@ -783,7 +783,7 @@ def _plans(cause: str, scene: Scene, rng: np.random.Generator) -> Iterator[Plan]
 
 
 def _deformed(world: World, change: Array, field: str = "xyz") -> Callable[[float], World]:
-    """The world with a target that differs from the design by a multiple of this change (p, 3) or (m, p, 3)."""
+    """The world with a target that differs from the design by a multiple of this change."""
     return lambda a: replace(world, **{field: getattr(world, field) + a * change})
 
 

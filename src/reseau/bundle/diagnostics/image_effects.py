@@ -17,7 +17,7 @@ _LENGTHS = (0.3, 0.6, 1.2)
 _DEGREE, _NODES = 4, 12
 """Degree of the polynomials that describe a smooth field, and nodes of the integration over the image."""
 _CREASES, _OF_CREASES = (0.15, 0.3, 0.6), 6
-"""Distances, in half the diagonal of a target, over which its heights are alike, and degree of polynomials."""
+"""Distances, in half the diagonal of a target, over which heights are alike; degree of their polynomials."""
 
 
 def smooth_effects(fit: BundleFit, degree: int = _DEGREE) -> tuple[Effect, dict[str, Array]]:
@@ -46,7 +46,7 @@ def smooth_effects(fit: BundleFit, degree: int = _DEGREE) -> tuple[Effect, dict[
 
 
 def creases(fit: BundleFit, flat: Array, slope: Array) -> tuple[Effect, dict[str, Array]]:
-    """Smooth displacements over a plane target, others in each image, and their forms by length, (images, q, q).
+    """Smooth displacements over a plane target, others in each image, and their forms, (images, q, q).
 
     `flat` are the used image points in the plane of the target (n, 2), and `slope` what one unit of each kind
     of displacement there does to them (n, 2, k).
