@@ -311,7 +311,9 @@ def _compared(
         single = {one.code: one for one in others if one is not None}
         found |= {code: one.log_evidence - sound for code, one in single.items()}
     if discrete and max(found.values()) > -np.log(_FALSE) and max(found, key=found.__getitem__) != "noise":
-        for one in (*alternatives(sight.result, _KNOWN), *_of_creases(sight)):
+        # Where the model was chosen, the richer ones have been compared.
+        richer = alternatives(sight.result, _KNOWN) if sight.result.rivals is None else ()
+        for one in (*richer, *_of_creases(sight)):
             if one.log_evidence - sound > found.get(one.code, -np.inf):
                 found[one.code] = one.log_evidence - sound
                 single[one.code] = one
