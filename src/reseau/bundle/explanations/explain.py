@@ -23,7 +23,7 @@ from ...core.threads import one_thread
 from ..diagnostics.evidence import Scores, scores, too_large, used_rows
 from ..diagnostics.fields import camera_mapping
 from ..diagnostics.result import Result
-from .alternatives import alternatives
+from .alternatives import alternatives, divided
 from .discrete import Single, gross_errors, other_cameras
 from .effects import Family, Sight, creased, families, lens_at
 from .names import Misnamed
@@ -309,6 +309,8 @@ def _compared(
         others = [gross_errors(sight, _KNOWN)]
         others += [] if near[1] is None else [other_cameras(near[0], near[1], _KNOWN)]
         single = {one.code: one for one in others if one is not None}
+        if (camera := single.get("other-camera")) and camera.log_evidence - sound > -np.log(_FALSE):
+            single["other-camera"] = divided(sight.result, camera, _KNOWN)
         found |= {code: one.log_evidence - sound for code, one in single.items()}
     if discrete and max(found.values()) > -np.log(_FALSE) and max(found, key=found.__getitem__) != "noise":
         # Where the model was chosen, the richer ones have been compared.
@@ -442,8 +444,6 @@ def _adjusted_with(form: _Form, sight: Sight) -> _Form:
         family = family.seen_again(seen)
         part = scores(again, [family.effect]).before(every)
         own = part.part(form.columns).scaled(units)
-        if not own.definite:
-            return best
         log = own.log_evidence(known=_KNOWN)
         if log > best.log_evidence:
             best = replace(form, family=family, log_evidence=log, adjusted=(seen, part, every))
