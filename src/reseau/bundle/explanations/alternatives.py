@@ -36,7 +36,12 @@ def alternatives(result: Result, known: float) -> Iterator[Single]:
 
 
 def divided(result: Result, among: Single, known: float) -> Single:
-    """The images of another camera, adjusted with one; as they were where that explains less."""
+    """The images of another camera, adjusted with one; as they were where that explains less.
+
+    Cameras that are fixed to each other are no other cameras in some of their exposures.
+    """
+    if result.network.rig is not None:
+        return among
     network = with_estimates(result)
     own, camera_of = int(network.camera_of[among.rows[0]]), network.camera_of.copy()
     camera_of[among.rows] = len(network.cameras)
