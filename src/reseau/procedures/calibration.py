@@ -157,7 +157,7 @@ def calibrate_camera(
             if isinstance(again, Failure) or again.sigma0 > _BETTER * done.sigma0:
                 break
             done = job.calibrated(alike)
-    return done if isinstance(done, Failure) else replace(done, corrected=seen.corrected)
+    return done if isinstance(done, Failure) else done.described(corrected=seen.corrected)
 
 
 @dataclass(frozen=True, eq=False)
