@@ -5,6 +5,7 @@ Modules of commands import other packages inside the commands, so that help and 
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from typing import Annotated, Any
@@ -43,6 +44,8 @@ from .declared import Commands
 __all__ = ["app", "main"]
 
 _COMPILING = "compiling for this processor, once, what this command calls; `reseau compile` does it ahead"
+_COLLECTING = (50_000, 20, 20)
+"""When circles of objects are looked for: seldom, since modules are most of what a command makes, and stay."""
 
 app = Commands(
     name="reseau",
@@ -113,7 +116,10 @@ def _options(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: 0 success, 1 failure, 2 usage error; errors in one line on stderr."""
-    sys.exit(run(arguments))
+    gc.set_threshold(*_COLLECTING)
+    status = run(arguments)
+    gc.freeze()  # what is left ends with the process
+    sys.exit(status)
 
 
 def run(arguments: list[str] | None = None) -> int:

@@ -33,12 +33,16 @@ def above(place: str) -> Any:
 
 @contextmanager
 def without_collecting() -> Iterator[None]:
-    """Look for no circles of objects while many are made that stay: imports and compilers make so many."""
+    """Look for no circles of objects while many are made that stay: imports and compilers make so many.
+
+    Neither are they looked through later, or when Python ends.
+    """
     collects = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
+        gc.freeze()
         if collects:
             gc.enable()
 
