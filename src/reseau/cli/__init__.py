@@ -8,9 +8,11 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from functools import cache
 from typing import Annotated, Any
 
 import typer
+from typer.main import get_command
 
 from ..core.errors import ReseauError
 from ..core.notice import before_compiling
@@ -45,7 +47,7 @@ __all__ = ["app", "main"]
 
 _COMPILING = "compiling for this processor, once, what this command calls; `reseau compile` does it ahead"
 _COLLECTING = (50_000, 20, 20)
-"""When circles of objects are looked for: seldom, since modules are most of what a command makes, and stay."""
+"""When circles of objects are looked for: seldom: modules are most of what a command makes."""
 
 app = Commands(
     name="reseau",
@@ -127,7 +129,7 @@ def run(arguments: list[str] | None = None) -> int:
     if sys.stderr.isatty():
         before_compiling(lambda: print(_COMPILING, file=sys.stderr))
     try:
-        return int(app(arguments, standalone_mode=False) or 0)
+        return int(_command()(arguments, standalone_mode=False) or 0)
     except ReseauError as error:
         return _report(str(error), error.exit_status)
     except ModuleNotFoundError as error:
@@ -147,6 +149,12 @@ def run(arguments: list[str] | None = None) -> int:
             raise
         said = str(format_message()).replace("Value error, ", "")  # of pydantic
         return _report(said or "see `reseau --help`", int(getattr(error, "exit_code", 2)))
+
+
+@cache
+def _command() -> Any:
+    """What Typer makes of all commands."""
+    return get_command(app)
 
 
 def _report(message: str, status: int) -> int:

@@ -336,7 +336,7 @@ def _bow_of(bow: Array, sigma: Array) -> float:
 
 def _frame_axes(corners: Array) -> tuple[Array, Array, Array]:
     """Start and end of the approximate edges and their inward normals, each (4, 2)."""
-    following = np.roll(corners, -1, axis=0)
+    following = corners[[1, 2, 3, 0]]
     along = (following - corners) / np.hypot(*(following - corners).T)[:, None]
     return corners, following, np.stack([-along[:, 1], along[:, 0]], axis=1)
 
@@ -350,8 +350,8 @@ def _corners(values: Array, corners: Array) -> Array:
 
 def shape_of(corners: Array, shape: FrameShape) -> Array:
     """Shape of corners (4, 2): three angles minus right angles, log of proportions over the format's."""
-    side = np.roll(corners, -1, axis=0) - corners
-    before = np.roll(side, 1, axis=0)
+    side = corners[[1, 2, 3, 0]] - corners
+    before = side[[3, 0, 1, 2]]
     turn = np.arctan2(before[:, 0] * side[:, 1] - before[:, 1] * side[:, 0], (before * side).sum(axis=1))
     length = np.hypot(*side.T)
     aspect = np.log((length[0] + length[2]) / (length[1] + length[3]) * shape.height / shape.width)

@@ -139,7 +139,7 @@ def _running(values: Array, level: float) -> Array:
 
 def _moved(corners: Array, ends: Array) -> Array:
     """Corners of a frame whose edges are moved inwards by `ends` (4, 2) at their start and end."""
-    following = np.roll(corners, -1, axis=0)
+    following = corners[[1, 2, 3, 0]]
     along = (following - corners) / np.hypot(*(following - corners).T)[:, None]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
     a, b = corners + ends[:, :1] * normal, following + ends[:, 1:] * normal
@@ -148,9 +148,10 @@ def _moved(corners: Array, ends: Array) -> Array:
 
 def crossings_of(a: Array, b: Array) -> Array:
     """Corners (4, 2) of lines through a and b, both (4, 2); corner k is where line k meets line k − 1."""
-    line = np.cross(np.column_stack([a, np.ones(4)]), np.column_stack([b, np.ones(4)]))
-    corner = np.cross(np.roll(line, 1, axis=0), line)
-    return np.asarray(corner[:, :2] / corner[:, 2:])
+    (ax, ay), (bx, by) = a.T, b.T
+    x, y, z = line = np.stack([ay - by, bx - ax, ax * by - ay * bx])
+    u, v, w = line[:, [3, 0, 1, 2]]
+    return np.asarray(np.stack([v * z - w * y, w * x - u * z], axis=1) / (u * y - v * x)[:, None])
 
 
 def _sides(guess: FrameGuess, grey: Plane) -> tuple[Array, Array]:
@@ -162,7 +163,7 @@ def _sides(guess: FrameGuess, grey: Plane) -> tuple[Array, Array]:
 def _beside(corners: Array, grey: Plane, offsets: Sequence[float]) -> Array:
     """Mean grey values (4, 80) along the edges at given distances inwards; NaN outside the overview."""
     t = (_ALONG + 1) / 2
-    a, b = corners, np.roll(corners, -1, axis=0)
+    a, b = corners, corners[[1, 2, 3, 0]]
     along = (b - a) / np.hypot(*(b - a).T)[:, None]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
     at = a[:, None] + t[:, None] * (b - a)[:, None]
