@@ -33,8 +33,8 @@ from . import kept
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
-_AROUND = {"capture", "cli", "http", "service", "sessions"}
-"""Tests of what is done with calibrations."""
+_AROUND = {"cameras", "capture", "cli", "exchange", "http", "service", "sessions", "tests"}
+"""Folders of tests of what is done with calibrations."""
 _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
@@ -102,7 +102,7 @@ def assets(tmp_path_factory: pytest.TempPathFactory) -> None:
 def few_poses(request: pytest.FixtureRequest) -> Iterator[None]:
     """Compare few photographs that could be proposed, and measure each once, where what follows is tested."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        around = request.path.parent.name in _AROUND or request.path.name == "test_api.py"
+        around = request.path.parent.name in _AROUND
         if around:
             monkeypatch.setattr(target_measurement, "measure_testfield", _measured_once)
             monkeypatch.setattr(figures, "to_bytes", _blank)

@@ -13,7 +13,8 @@ ROOT = Path(__file__).resolve().parents[2]
 IMPORT_ALL = """
 import tests.portable.hidden
 tests.portable.hidden.hide()
-import importlib, pkgutil
+import gc, importlib, pkgutil
+gc.disable()
 for package in ("reseau", "reseau_drivers", "reseau_sims"):
     for found in pkgutil.walk_packages([importlib.import_module(package).__path__[0]], package + "."):
         if found.name.endswith("__main__") or "gige_process" in found.name:
