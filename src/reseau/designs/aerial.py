@@ -22,34 +22,12 @@ its marks is not published: there is a design for each form, to be chosen by wha
 
 from __future__ import annotations
 
-from typing import Any
-
 from ..core.errors import UsageError
 from ..io import FiducialDesign, FiducialMark, FiducialPoint, MarkPart
 
 _CORNERS = {"1": (-1, -1), "2": (1, 1), "3": (-1, 1), "4": (1, -1)}
 _MIDDLES = {"5": (-1, 0), "6": (1, 0), "7": (0, 1), "8": (0, -1)}
 
-_MARKS: dict[str, tuple[float, list[dict[str, Any]]]] = {
-    "cross": (0.6, [{"shape": "cross", "size": 3.86, "line_width": 0.1, "gap": 0.7}]),
-    "circle": (
-        0.5,
-        [
-            {"shape": "ring", "size": 1.9, "line_width": 0.18},
-            {"shape": "cross", "size": 3.45, "line_width": 0.05, "gap": 0.57},
-        ],
-    ),
-    "top": (
-        0.4,
-        [
-            {"shape": "disk", "size": 0.155},
-            {"shape": "ring", "size": 1.85, "line_width": 0.3},
-            {"shape": "cross", "size": 2.15, "line_width": 0.155, "gap": 0.62},
-        ],
-    ),
-    "dot": (0.7, [{"shape": "disk", "size": 0.2}]),
-}
-"""Margin and parts of marks."""
 _USGS = "nominal, beside {} USGS calibration reports"
 _LMK = "nominal, beside USGS report OSL/1551; the form of the marks is not published"
 _CAMERAS: dict[str, tuple[str, float, tuple[str, float] | None, tuple[str, float] | None, str]] = {
@@ -131,9 +109,8 @@ def aerial_camera(name: str) -> FiducialDesign:
         if marked is None:
             continue
         mark, away = marked
-        margin, parts = _MARKS[mark]
-        made = tuple(MarkPart(**each) for each in parts)
-        marks[mark] = FiducialMark(polarity="bright", parts=made, margin=margin)
+        margin, *parts = _marks()[mark]
+        marks[mark] = FiducialMark(polarity="bright", parts=tuple(parts), margin=margin)
         # The arms of crosses in the corners point along the diagonals.
         turn = 45.0 if places is _CORNERS else 0.0
         points += [
@@ -141,3 +118,22 @@ def aerial_camera(name: str) -> FiducialDesign:
             for key, (x, y) in places.items()
         ]
     return FiducialDesign(name=title, source=source, marks=marks, points=tuple(points))
+
+
+def _marks() -> dict[str, tuple[float, MarkPart, *tuple[MarkPart, ...]]]:
+    """Margins and parts of marks."""
+    return {
+        "cross": (0.6, MarkPart(shape="cross", size=3.86, line_width=0.1, gap=0.7)),
+        "circle": (
+            0.5,
+            MarkPart(shape="ring", size=1.9, line_width=0.18),
+            MarkPart(shape="cross", size=3.45, line_width=0.05, gap=0.57),
+        ),
+        "top": (
+            0.4,
+            MarkPart(shape="disk", size=0.155),
+            MarkPart(shape="ring", size=1.85, line_width=0.3),
+            MarkPart(shape="cross", size=2.15, line_width=0.155, gap=0.62),
+        ),
+        "dot": (0.7, MarkPart(shape="disk", size=0.2)),
+    }

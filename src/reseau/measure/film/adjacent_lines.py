@@ -120,14 +120,8 @@ class Softness(NamedTuple):
 
 def student(value: Array, scale: Array | float) -> Array:
     """Density of Student's distribution with four degrees of freedom."""
-    square = np.asarray(value / (2 * scale))
-    square *= square
-    square += 1
-    root = np.sqrt(square)
-    square *= square
-    square *= root  # the power 5/2
-    square *= scale
-    return np.divide(0.375, square, out=square)
+    square = 1 + np.square(value / (2 * scale))
+    return np.asarray(0.375 / (square * square * np.sqrt(square) * scale))
 
 
 def softness_of(widths: Sequence[tuple[float, float] | None], side: float) -> list[Softness]:
