@@ -27,6 +27,8 @@ from reseau.measure.film.roll import corner_files, rolls_of
 from reseau.procedures.film_frame import reorient_scan
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 
+from ..montecarlo import slowly
+
 BUSY = Beside(perforations=True, print=True, neighbours=True, dust=40, scratches=3)
 
 
@@ -54,20 +56,17 @@ def covered(result: FrameResult, frame: FilmFrame) -> bool:
     [
         FilmFrame(3, tilt_deg=-14.0, mirrored=True, format=HASSELBLAD, dpi=400),
         FilmFrame(4, negative=True, beside=BUSY),
-        *(
-            pytest.param(frame, marks=pytest.mark.slow)
-            for frame in (
-                FilmFrame(1),
-                FilmFrame(2, tilt_deg=14.0, beside=BUSY),
-                FilmFrame(5, beside=Beside(lines=1)),
-                FilmFrame(6, beside=Beside(rods=1)),
-                FilmFrame(7, beside=Beside(blown=True)),
-                FilmFrame(8, bow_mm=0.1),
-                FilmFrame(9, format=RICOH._replace(radius=1.5)),
-                FilmFrame(10, bits=16),
-            )
+        *slowly(
+            FilmFrame(1),
+            FilmFrame(2, tilt_deg=14.0, beside=BUSY),
+            FilmFrame(5, beside=Beside(lines=1)),
+            FilmFrame(6, beside=Beside(rods=1)),
+            FilmFrame(7, beside=Beside(blown=True)),
+            FilmFrame(8, bow_mm=0.1),
+            FilmFrame(9, format=RICOH._replace(radius=1.5)),
+            FilmFrame(10, bits=16),
+            FilmFrame(11, contrast=0.3),
         ),
-        pytest.param(FilmFrame(11, contrast=0.3), marks=pytest.mark.slow),
     ],
     ids=lambda frame: f"seed {frame.seed}",
 )
