@@ -20,9 +20,7 @@ from .test_bundle import looking_at
 Run = Callable[..., tuple[int, str, str]]
 SIGMA = 0.05
 CONTROL = (0, 1, 2, 3, 4, 5)
-PARTS = pytest.mark.parametrize(
-    "part", [0.05, 0.2, *(pytest.param(each, marks=pytest.mark.slow) for each in (0.01, 0.1))]
-)
+PARTS = pytest.mark.parametrize("part", [0.2, *slowly(0.01, 0.05, 0.1)])
 """Of the observations that are wrong."""
 
 
