@@ -248,6 +248,8 @@ class World:
         Cameras.
     xyz : ndarray (p, 3)
         Points of the target.
+    bent : ndarray (m, p, 3)
+        What is added to them in each image.
     rotation, shift : ndarray (m, 3, 3), (m, 3)
         Poses.
     zoom : ndarray (m,)
@@ -262,6 +264,7 @@ class World:
 
     lenses: tuple[Lens, ...]
     xyz: Array
+    bent: Array
     rotation: Array
     shift: Array
     zoom: Array
@@ -325,7 +328,7 @@ class Scene:
         found = []
         for i, (c, rows) in enumerate(zip(self.camera_of, self.seen, strict=True)):
             lens = world.lenses[c]
-            x = world.xyz[rows] @ world.rotation[i].T + world.shift[i]
+            x = (world.xyz + world.bent[i])[rows] @ world.rotation[i].T + world.shift[i]
             xy = lens.imaged(x)
             if world.speed[i].any():
                 xy = _line_by_line(lens, x, xy, world.speed[i])
@@ -615,8 +618,8 @@ def draw_scene(setup: SetUp, rng: np.random.Generator, flat: bool) -> Scene:
         exposure_of[-len(lenses) :] = [exposure_of[-len(lenses)]] * len(lenses)
     m = len(seen)
     world = World(
-        lenses, xyz, np.array(rotation), np.array(shift), np.ones(m), np.zeros((m, 2)), np.ones(m),
-        np.zeros((m, 6)),
+        lenses, xyz, np.zeros((m, *xyz.shape)), np.array(rotation), np.array(shift), np.ones(m),
+        np.zeros((m, 2)), np.ones(m), np.zeros((m, 6)),
     )  # fmt: skip
     noise = tuple(rng.normal(size=(len(rows), 2)) for rows in seen)
     return Scene(
@@ -657,6 +660,16 @@ def _deflection(target: Target, rng: np.random.Generator, kind: str) -> Array:
     z = u**2 if kind == "cylinder" else u**2 - v**2
     found = np.zeros((len(z), 3))
     found[:, 2] = rng.choice([-1.0, 1.0]) * (z - z.mean())
+    return found
+
+
+def _creases(target: Target, rng: np.random.Generator) -> Array:
+    """Heights (p, 3) of about unit size of a target that is not stiff: three waves."""
+    s = target.xy / target.diagonal
+    found = np.zeros((len(s), 3))
+    for _ in range(3):
+        turn, length, phase = rng.uniform(0, np.pi), rng.uniform(0.4, 1.5), rng.uniform(0, 2 * np.pi)
+        found[:, 2] += np.sin(2 * np.pi * (s @ [np.cos(turn), np.sin(turn)]) / length + phase)
     return found
 
 
@@ -746,7 +759,11 @@ def _plans(cause: str, scene: Scene, rng: np.random.Generator) -> Iterator[Plan]
         yield Plan("all exposures", moved, 1e-3, 0.2, *right)
         return
     if cause == "target-shape":
-        for kind in rng.permutation(["cylinder", "saddle"]):
+        for kind in rng.permutation(["cylinder", "saddle", "creased"]):
+            if kind == "creased":
+                creases = target.diagonal * np.array([_creases(target, rng) for _ in range(m)])
+                yield Plan(kind, _deformed(world, creases, "bent"), 1e-3, 0.05, *right)
+                continue
             bend = target.diagonal * _deflection(target, rng, kind)
             yield Plan(kind, _deformed(world, bend), 2e-3, 0.15, *right)
         return
@@ -765,9 +782,9 @@ def _plans(cause: str, scene: Scene, rng: np.random.Generator) -> Iterator[Plan]
     raise ValueError(cause)
 
 
-def _deformed(world: World, change: Array) -> Callable[[float], World]:
-    """The world with a target that differs from the design by a multiple of this change (p, 3)."""
-    return lambda a: replace(world, xyz=world.xyz + a * change)
+def _deformed(world: World, change: Array, field: str = "xyz") -> Callable[[float], World]:
+    """The world with a target that differs from the design by a multiple of this change."""
+    return lambda a: replace(world, **{field: getattr(world, field) + a * change})
 
 
 def _places(target: Target) -> Array:

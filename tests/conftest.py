@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import uuid
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import pytest
 import scipy.linalg  # noqa: F401  # loads a library of its own beside that of NumPy
 import sqlalchemy as sa
 from hypothesis import settings
+from matplotlib.figure import Figure
 
 from reseau.archive import Archive
+from reseau.core import figures
+from reseau.core.data import Frame
+from reseau.core.failure import Failure
+from reseau.core.figures import to_bytes
 from reseau.core.threads import always_one_thread
-from reseau.procedures import next_pose
+from reseau.io import TestfieldDesign
+from reseau.measure.points import Measured
+from reseau.measure.testfield.measure import TestfieldOptions, measure_testfield
+from reseau.procedures import next_pose, target_measurement
 
 from . import kept
 
@@ -23,14 +33,24 @@ from . import kept
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
-_AROUND = {"capture", "cli", "http", "service", "sessions"}
-"""Tests of what is done with calibrations."""
+_AROUND = {"cameras", "capture", "cli", "exchange", "http", "service", "sessions", "tests"}
+"""Folders of tests of what is done with calibrations."""
 _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 # Workers share the processors: so do the commands that tests start.
 always_one_thread()
 os.environ |= {name: os.environ.get(name, "1") for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+
+
+# What is imported and collected stays.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Look through what tests make, and not through all modules again."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
@@ -80,13 +100,28 @@ def assets(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(autouse=True, scope="module")
 def few_poses(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Compare few of the photographs that could be proposed, where what is done with them is tested."""
+    """Compare few photographs that could be proposed, and measure each once, where what follows is tested."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        if request.path.parent.name in _AROUND or request.path.name == "test_api.py":
+        around = request.path.parent.name in _AROUND
+        if around:
+            monkeypatch.setattr(target_measurement, "measure_testfield", _measured_once)
+            monkeypatch.setattr(figures, "to_bytes", _blank)
+        if around or request.path.parent.name in ("procedures", "report"):
             every = next_pose._candidates
             monkeypatch.setattr(next_pose, "_candidates", lambda: islice(every(), 0, None, 9))
             monkeypatch.setattr(next_pose, "_STEPS", ())
         yield
+
+
+def _measured_once(
+    frame: Frame, design: TestfieldDesign, options: TestfieldOptions | None = None
+) -> Measured | Failure:
+    return kept.once(measure_testfield, frame, design, options)
+
+
+def _blank(figure: Figure, kind: str, **options: Any) -> bytes:
+    """Figures of pages are made, but not drawn: what they show is tested with the reports."""
+    return b"<svg viewBox='0 0 1 1'></svg>" if kind == "svg" else to_bytes(figure, kind, **options)
 
 
 @pytest.fixture(autouse=True, scope="session")

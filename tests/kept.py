@@ -1,4 +1,4 @@
-"""Pictures that take long to draw: kept by content, for all workers and runs."""
+"""What takes long, kept by content: pictures for all workers and runs, other results by each worker."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ import hashlib
 import inspect
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from reseau.core.data import Array
 
+T = TypeVar("T")
 FOLDER: Path | None = None
 """Where they are kept, in pytest's cache; without it nothing is."""
 _DAYS = 30
@@ -49,6 +50,20 @@ def picture(view: Drawn) -> Array:
         np.save(file, pixels)
     written.replace(kept)
     return pixels
+
+
+_FOUND: dict[tuple[object, bytes], object] = {}
+
+
+def once(function: Callable[..., T], *arguments: object) -> T:
+    """What a function returns, computed once for each content of its arguments."""
+    digest = hashlib.sha256()
+    for part in _content(arguments):
+        digest.update(part + b"\0")
+    key = function, digest.digest()
+    if key not in _FOUND:
+        _FOUND[key] = function(*arguments)
+    return _FOUND[key]  # type: ignore[return-value]
 
 
 def clear_unused(folder: Path) -> None:

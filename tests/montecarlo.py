@@ -1,9 +1,10 @@
-"""Monte Carlo in two tiers: draws that show a factor of 1.3 at each commit, all of them in `make slow`."""
+"""Two tiers: at each commit a case of each kind, and draws that show a factor of 1.3; all in `make slow`."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from _pytest.mark.structures import ParameterSet
 
 _SHOWN = 1 - 1 / 1.3**2
 """What a mean square of normalised errors lacks when sigma is 1.3 times too large."""
@@ -14,6 +15,12 @@ _BOUND = 3.5
 def draws(few: int, every: int) -> pytest.MarkDecorator:
     """Run a test with few draws, and as a slow one with every draw: its parameter `runs`."""
     return pytest.mark.parametrize("runs", [few, pytest.param(every, marks=pytest.mark.slow)])
+
+
+def slowly(*cases: object) -> list[ParameterSet]:
+    """Cases for `make slow`: they repeat in kind what others show."""
+    each = (case if isinstance(case, tuple) else (case,) for case in cases)
+    return [pytest.param(*case, marks=pytest.mark.slow) for case in each]
 
 
 def tolerance(degrees: float) -> float:

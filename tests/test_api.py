@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -125,24 +126,6 @@ def photographs() -> list[reseau.Frame]:
     return [bench.record(station) for station in paper_stations()[::5]]
 
 
-def test_photographs_become_a_calibration_its_file_and_its_plot(
-    photographs: list[reseau.Frame], tmp_path: Path
-) -> None:
-    calibrated = reseau.calibrate(photographs, FieldBench().design, pitch_mm=0.027).required()
-    assert len(repr(calibrated)) < 500
-    assert "sigma0" in repr(calibrated)
-    assert calibrated.assessment is not None
-    assert calibrated.assessment.short in repr(calibrated)
-    assert len(calibrated.plot(photographs[0])) == 4
-    calibrated.write(tmp_path / "camera.json")
-    calibration = reseau.read_calibration(tmp_path / "camera.json")
-    estimate = calibrated.cameras["camera"]
-    assert calibration.values()["c"] == dict(zip(estimate.parameters, estimate.values, strict=True))["c"]
-    assert calibration.assessment == calibrated.assessment
-    assert len(repr(calibration)) < 300
-    assert calibration.plot().get_title(loc="left") == "error of the projection / px"
-
-
 @pytest.mark.slow
 def test_a_folder_is_enough_and_the_target_is_found(photographs: list[reseau.Frame], tmp_path: Path) -> None:
     for frame in photographs:
@@ -161,7 +144,7 @@ def test_channels_of_arrays_are_told_by_their_order() -> None:
     assert (reseau.read_image(COLOUR, colours="bgr").pixels < one).all()
 
 
-def test_the_lines_of_the_readme_make_a_calibration_of_photographs(
+def test_the_lines_of_the_readme_make_of_photographs_a_calibration_its_file_and_its_plot(
     photographs: list[reseau.Frame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     readme = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
@@ -172,8 +155,20 @@ def test_the_lines_of_the_readme_make_a_calibration_of_photographs(
         write_image(tmp_path / "photos" / f"{frame.name}.jpg", frame.pixels)
     FieldBench().design.write(tmp_path / "board.json")
     monkeypatch.chdir(tmp_path)
-    exec(compile(lines, "README.md", "exec"), {})
-    assert reseau.read_calibration("camera.json").kind == "camera"
+    exec(compile(lines, "README.md", "exec"), names := dict[str, Any]())
+    calibrated = names["calibrated"]
+    assert len(repr(calibrated)) < 500
+    assert "sigma0" in repr(calibrated)
+    assert calibrated.assessment.short in repr(calibrated)
+    assert len(calibrated.plot(photographs[0])) == 4
+    calibration = reseau.read_calibration("camera.json")
+    assert calibration.kind == "camera"
+    estimate = calibrated.cameras["camera"]
+    (name, *_), (value, *_) = estimate.parameters, estimate.values
+    assert calibration.values()[name] == value
+    assert calibration.assessment == calibrated.assessment
+    assert len(repr(calibration)) < 300
+    assert calibration.plot().get_title(loc="left") == "error of the projection / px"
 
 
 def test_measured_marks_are_shown_written_and_read_back(

@@ -40,3 +40,16 @@ def test_a_picture_is_drawn_once_for_each_content(tmp_path: Path, monkeypatch: p
     for view, picture in zip(views, first, strict=True):
         np.testing.assert_array_equal(kept.picture(replace(view)), picture)
     assert len(View.drawn) == len(views)
+
+
+def test_a_result_is_computed_once_for_each_content() -> None:
+    asked: list[View] = []
+
+    def shown(view: View, factor: float) -> float:
+        asked.append(view)
+        return float(view.marks[0].sum()) * factor
+
+    for _ in range(2):
+        assert [kept.once(shown, View((np.full(3, k),)), 2.0) for k in (1.0, 2.0)] == [6.0, 12.0]
+        assert kept.once(shown, View((np.full(3, 1.0),)), 3.0) == 9.0
+    assert len(asked) == 3

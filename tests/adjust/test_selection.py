@@ -11,6 +11,8 @@ from reseau.adjust.fitted import compare
 from reseau.adjust.problem import GaussHelmert
 from reseau.core.errors import UsageError
 
+from ..montecarlo import slowly
+
 T = np.linspace(-1.0, 1.0, 40)
 POWERS = np.stack([T**i for i in range(6)], axis=1)
 NAMES = [f"a{i}" for i in range(6)]
@@ -158,7 +160,7 @@ def test_invalid_groups_are_errors(groups, words):
         variance_components(polynomial(cubic()), groups)
 
 
-@pytest.mark.parametrize("rho", [0.3, -0.85])
+@pytest.mark.parametrize("rho", [*slowly(0.3), -0.85])
 def test_variance_components_of_correlated_groups_are_the_true_ones_in_the_mean(rho):
     """Pairs of x and y whose sigmas are 2 and 0.5 times those given, their correlation as given."""
     rng, squares, factors = np.random.default_rng(9), np.zeros(2), []

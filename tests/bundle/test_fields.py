@@ -12,7 +12,7 @@ from reseau.bundle.diagnostics.fields import camera_mapping, projection_field_at
 from reseau.calibration import CameraMapping, FieldDifference, calibration_difference, projection_field
 from reseau.core.errors import UsageError
 
-from ..montecarlo import draws, tolerance
+from ..montecarlo import draws, slowly, tolerance
 from . import networks
 
 
@@ -142,7 +142,7 @@ def test_a_calibration_file_gives_the_field_of_the_adjustment() -> None:
     )
 
 
-@pytest.mark.parametrize("datum", ["control", "free"])
+@pytest.mark.parametrize("datum", [*slowly("control"), "free"])
 @pytest.mark.parametrize("distance", [3.0, 40.0])
 def test_normalised_errors_at_a_distance_have_mean_square_one(datum: str, distance: float) -> None:
     """Points before the camera, carried into object space by the true poses and back by the estimates."""

@@ -147,13 +147,9 @@ def test_the_joint_covariance_of_any_unknowns_is_that_of_the_dense_engine() -> N
     twin = dense_twin(world, network)
     # Point p8 takes part in a distance and is not eliminated, p5 and p6 are; p3 is held in X.
     names = [
-        "c of camera cam",
-        "X of point p5",
-        "Z of point p6",
-        "Y of point p8",
-        "Y0 of image i2",
-        "X of point p3",
-    ]
+        "c of camera cam", "X of point p5", "Z of point p6", "Y of point p8", "Y0 of image i2",
+        "X of point p3"
+    ]  # fmt: skip
     theirs = twin.covariance_of("c", "p5.0", "p6.2", "p8.1", "i2.4")
     mine = result.covariance_of(*names)
     size = np.sqrt(np.diag(theirs))

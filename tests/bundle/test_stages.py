@@ -19,6 +19,7 @@ from reseau.core.errors import UsageError
 from reseau.core.failure import Code, Failure
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
 
+from ..montecarlo import slowly
 from .turntables import AXIS, POINT, Table, turned
 
 STEPS_DEG = (0, 40, 100, 150, 220, 300)
@@ -137,10 +138,7 @@ def test_all_datums_give_the_same_shape_and_angles() -> None:
     "how",
     [
         {},
-        *(
-            pytest.param({"control": True} | more, marks=pytest.mark.slow)
-            for more in ({}, {"sigma": None}, {"cameras": 2})
-        ),
+        *slowly(*({"control": True} | more for more in ({}, {"sigma": None}, {"cameras": 2}))),
     ],
 )
 def test_the_axis_is_found_from_images_without_poses(how: dict[str, Any]) -> None:

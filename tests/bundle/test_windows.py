@@ -17,6 +17,7 @@ from reseau.core.errors import UsageError
 from reseau.optics.refraction import Window
 from reseau.optics.refraction.windows import Refraction, RefractiveIndex
 
+from ..montecarlo import slowly
 from . import cavity, networks
 
 # Figures of README.txt of the data, and those of the fits of single cameras, px.
@@ -122,7 +123,7 @@ def with_bars(world: networks.World) -> networks.World:
     return replace(world, network=replace(world.network, distance_of=bar, distance=distance))
 
 
-@pytest.mark.parametrize("kind", ["plane port", "dome"])
+@pytest.mark.parametrize("kind", [*slowly("plane port"), "dome"])
 def test_a_free_network_behind_ports_takes_its_scale_from_a_distance(kind: str) -> None:
     world = networks.refracted(networks.world(datum="free", control=0, cameras=LENS), kind, free=())
     fit = networks.by_itself(with_bars(world).noisy(0)).adjusted()

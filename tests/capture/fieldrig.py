@@ -25,6 +25,7 @@ from reseau.procedures.target_measurement import measurer_of
 from reseau.procedures.testfield import TestfieldProcedure
 from reseau_sims import FieldBench, Station
 
+from .. import kept
 from .simple import CameraSettings, Simple, Taken
 
 AXES = ("tilt", "roll", "camera_roll")
@@ -112,7 +113,9 @@ class FieldCamera(Simple):
     def expose(self, seconds: float | None = None) -> Taken:
         self.exposures += 1
         self.during(self.exposures)
-        frame = self.field.record(Station(*(self.table.stands[axis] for axis in self.table.stands)))
+        station = Station(*(self.table.stands[axis] for axis in self.table.stands))
+        own = isinstance(self.field, FieldBench)
+        frame = kept.once(FieldBench.record, self.field, station) if own else self.field.record(station)
         pixels = self.spoil(self.exposures, frame.pixels)
         return Taken(Frame(pixels, 255.0), self.exposures, datetime.now(UTC), self.settings.exposure_us)
 

@@ -26,6 +26,7 @@ from reseau_drivers.camera import v4l2
 from reseau_sims.pixels import PixelSensor
 from reseau_sims.serving import LampScene, SimulatedCamera, VideoCamera
 
+from ..montecarlo import slowly
 from .killing import Ended, ended
 
 PLAN = SensorSeriesPlan(levels=10, frames=3, longest_us=40_000.0)
@@ -148,7 +149,7 @@ def test_missing_and_excessive_light_are_reported(tmp_path: Path) -> None:
             assert not kept.frames(kind="frame")
 
 
-@pytest.mark.parametrize("light", [0.1, 3.0])
+@pytest.mark.parametrize("light", [*slowly(0.1), 3.0])
 def test_exposures_range_from_little_light_to_saturation(kept: Session, light: float) -> None:
     rig = Rig(light)
     with rig.bench:

@@ -158,15 +158,8 @@ def test_components_and_elimination_search_the_model(
 ) -> None:
     """K2, P1 and P2, which the lens does not have, are dropped; the sigmas of x and y are confirmed."""
     files = (
-        "-o",
-        tmp_path / "K.json",
-        "--report",
-        tmp_path / "F.html",
-        "--distance",
-        1500,
-        "--distance",
-        9000,
-    )
+        "-o", tmp_path / "K.json", "--report", tmp_path / "F.html", "--distance", 1500, "--distance", 9000
+    )  # fmt: skip
     free = ("--free", "c,x0,y0,K1,K2,P1,P2", "--eliminate", 0.001, "--components", "axes")
     status, out, err = reseau(*common(measured), *free, *files)
     assert (status, err) == (0, "")
@@ -322,17 +315,9 @@ def test_measurements_are_kept_in_a_store_and_not_repeated(
     BENCH.design.write(tmp_path / "field.json")
     files = photographs(tmp_path / "photos")
     command = (
-        "calibrate",
-        *files,
-        "-d",
-        tmp_path / "field.json",
-        "--pitch-mm",
-        0.027,
-        "--free",
-        "c",
-        "--jobs",
-        1,
-    )
+        "calibrate", *files, "-d", tmp_path / "field.json", "--pitch-mm", 0.027, "--free", "c", "--jobs",
+        1
+    )  # fmt: skip
     kept = (*command, "--store", tmp_path / "store", "-o", tmp_path / "kept.json")
     assert reseau(*kept)[0] == 0
     measured = (tmp_path / "kept.json").read_bytes()

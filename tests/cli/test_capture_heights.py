@@ -11,15 +11,8 @@ from reseau_sims import FieldBench
 from ..capture.fieldrig import AXES, FieldRig, enter, write_inputs
 
 HEIGHTS = (
-    "--heights",
-    "0,150,300",
-    "--height-sigma",
-    "0.05",
-    "--axis-sigma-mrad",
-    "5",
-    "--field-sigma",
-    "0.001",
-)
+    "--heights", "0,150,300", "--height-sigma", "0.05", "--axis-sigma-mrad", "5", "--field-sigma", "0.001"
+)  # fmt: skip
 
 
 @pytest.fixture

@@ -17,15 +17,8 @@ SCALE = 40.0
 """Pixels per millimetre."""
 ROWS, PITCH, COUNT = 28.17, 4.75, 7
 OPTIONS = (
-    "--left",
-    "88,160,200,239",
-    "--right",
-    "1215,160,1327,239",
-    "--perforation-px",
-    190,
-    "--number",
-    COUNT,
-)
+    "--left", "88,160,200,239", "--right", "1215,160,1327,239", "--perforation-px", 190, "--number", COUNT
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

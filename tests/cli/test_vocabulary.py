@@ -103,17 +103,9 @@ def test_options_are_in_groups_in_one_order(reseau: Run) -> None:
 def test_commands_are_in_the_order_of_the_work(reseau: Run) -> None:
     out = reseau("--help")[1]
     order = (
-        "calibrate",
-        "measure",
-        "bundle",
-        "apply",
-        "compare",
-        "design",
-        "capture",
-        "archive",
-        "serve",
-        "demo",
-    )
+        "calibrate", "measure", "bundle", "apply", "compare", "design", "capture", "archive", "serve",
+        "demo"
+    )  # fmt: skip
     places = [out.index(f"│ {name} ") for name in order]
     assert places == sorted(places)
 

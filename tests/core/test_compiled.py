@@ -36,7 +36,8 @@ def total(values):
 """
 
 RUN = """
-import sys
+import gc, sys
+gc.disable()
 sys.path.insert(0, sys.argv[1])
 import numpy as np
 from numba.core import event

@@ -15,7 +15,8 @@ import tifffile
 from reseau.core.optional import missing
 
 HIDING = """
-import sys
+import gc, sys
+gc.disable()
 
 class Hidden:
     def find_spec(self, name, path=None, target=None):

@@ -50,6 +50,7 @@ def test_a_bench_is_automated_and_scheduled(tmp_path: Path, monkeypatch: pytest.
     assert "SUMMARY:weekly: scheduled" in Path("weekly.ics").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_a_camera_is_calibrated_its_report_read_and_its_certificate_issued(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

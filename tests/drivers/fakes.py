@@ -20,19 +20,9 @@ from numpy.typing import NDArray
 from reseau.instruments import Deadline
 
 __all__ = [
-    "GrblBoard",
-    "Lines",
-    "MarlinBoard",
-    "NewportStage",
-    "Receiver",
-    "Screen",
-    "Spoiled",
-    "TCube",
-    "Transcript",
-    "Wire",
-    "ZaberStage",
-    "transcripts",
-]
+    "GrblBoard", "Lines", "MarlinBoard", "NewportStage", "Receiver", "Screen", "Spoiled", "TCube",
+    "Transcript", "Wire", "ZaberStage", "transcripts"
+]  # fmt: skip
 
 
 class Receiver(Protocol):

@@ -97,12 +97,8 @@ def dicom_folder(tmp_path: Path) -> Pair:
 
 
 DETECTORS: list[Callable[[Path], Pair]] = [
-    ping360_scanner,
-    keysight_oscilloscope,
-    bk_scanner,
-    pulser_scanner,
-    dicom_folder,
-]
+    ping360_scanner, keysight_oscilloscope, bk_scanner, pulser_scanner, dicom_folder
+]  # fmt: skip
 TABLES: list[Callable[[], Pair]] = [zaber_table, smc100_table]
 
 

@@ -155,13 +155,8 @@ def ply(columns: dict[str, np.ndarray]) -> bytes:
     table = np.rec.fromarrays(list(columns.values()), names=list(columns))
     lines = [f"property {kinds[column.dtype.kind]} {name}" for name, column in columns.items()]
     head = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(table)}",
-        *lines,
-        "end_header",
-        "",
-    ]
+        "ply", "format binary_little_endian 1.0", f"element vertex {len(table)}", *lines, "end_header", ""
+    ]  # fmt: skip
     return "\n".join(head).encode() + table.tobytes()
 
 

@@ -12,16 +12,9 @@ from scipy.ndimage import gaussian_filter
 from reseau.core.data import Array
 
 __all__ = [
-    "CURVATURES",
-    "FOCUS",
-    "INDICES",
-    "PITCH",
-    "PRINCIPAL",
-    "STOP_RADIUS",
-    "THICKNESS",
-    "drawn",
-    "principal_pixel",
-]
+    "CURVATURES", "FOCUS", "INDICES", "PITCH", "PRINCIPAL", "STOP_RADIUS", "THICKNESS", "drawn",
+    "principal_pixel"
+]  # fmt: skip
 
 CURVATURES, THICKNESS = (0.012, -0.022), 4.0
 INDICES = ((486.1, 1.5224), (587.6, 1.5168), (656.3, 1.5143))

@@ -26,17 +26,9 @@ from reseau.optics.field import SmoothField
 from reseau.optics.resampling import on_lattice
 
 __all__ = [
-    "Agreement",
-    "RealFrame",
-    "agreement",
-    "collocation",
-    "data_directory",
-    "inner_marks",
-    "leave_one_out",
-    "load",
-    "names",
-    "piecewise_linear",
-]
+    "Agreement", "RealFrame", "agreement", "collocation", "data_directory", "inner_marks", "leave_one_out",
+    "load", "names", "piecewise_linear"
+]  # fmt: skip
 
 PX_PER_MM = 84.821428
 NEAR_MARK_PX = 7

@@ -27,6 +27,7 @@ from reseau.measure.boards.tags import read_tags
 from reseau.measure.plane.lattice_mapping import started
 
 from .. import kept
+from ..montecarlo import slowly
 from .board_pictures import picture
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -134,7 +135,9 @@ def test_a_grid_of_markers_is_what_opencv_draws_as_a_grid_board() -> None:
     assert np.abs(found.xy - (own - own[0]) * 7 - 39.5).max() < 0.6  # OpenCV draws whole pixels
 
 
-@pytest.mark.parametrize("family", ["4X4_50", "7X7_50", "ARUCO_ORIGINAL", "APRILTAG_25h9", "ARUCO_MIP_36h12"])
+@pytest.mark.parametrize(
+    "family", ["4X4_50", *slowly("7X7_50", "ARUCO_ORIGINAL", "ARUCO_MIP_36h12"), "APRILTAG_25h9"]
+)
 def test_scattered_tags_are_points_of_their_numbers(family: str) -> None:
     poses = {3: (15.0, 20.0), 11: (35.0, -70.0), 20: (45.0, 130.0)}
     shown, expected = [], {}
@@ -181,7 +184,7 @@ def test_circles_have_no_eccentricity_at_60_degrees(design: BoardDesign, ways: i
 @pytest.mark.parametrize(
     ("design", "printed", "seed"),
     [
-        (board("charuco", 9, 6, 30.0, size=22.0, dictionary="DICT_4X4_100"), CHARUCO_PRINT, 1),
+        *slowly((board("charuco", 9, 6, 30.0, size=22.0, dictionary="DICT_4X4_100"), CHARUCO_PRINT, 1)),
         (board("circles", 9, 7, 25.0, size=12.0), prints.circles(9, 7, 25.0, 12.0), 4),
     ],
 )
@@ -201,8 +204,7 @@ def test_few_large_marks_through_a_lens_have_the_sigmas_of_their_errors(
     ("design", "printed", "wide", "seed", "nearer"),
     [
         (CLOSE, CLOSE_PRINT, True, 51, 1.7),
-        pytest.param(CLOSE, CLOSE_PRINT, True, 52, 1.7, marks=pytest.mark.slow),
-        pytest.param(CLOSE, CLOSE_PRINT, False, 111, 2.6, marks=pytest.mark.slow),
+        *slowly((CLOSE, CLOSE_PRINT, True, 52, 1.7), (CLOSE, CLOSE_PRINT, False, 111, 2.6)),
         (board("circles", 9, 7, 25.0, size=12.0), prints.circles(9, 7, 25.0, 12.0), False, 110, 2.6),
     ],
 )
@@ -253,7 +255,7 @@ class Action(Wide):
     _lens = (-0.25, 0.075, -0.0003, 0.0003)
 
 
-@pytest.mark.parametrize("seed", [62, pytest.param(64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [62, *slowly(64)])
 def test_a_lattice_grows_through_the_many_saddles_of_sharpened_edges_behind_a_wide_lens(seed: int) -> None:
     """Where the next corner is expected, edges have saddles that are nearer than the corner."""
     design, printed = board("chess", 9, 7, 30.0), prints.chess(9, 7, 30.0)
@@ -354,7 +356,7 @@ def test_corners_on_paper_that_is_saturated_everywhere_are_measured_to_their_sig
     ("family", "seed", "light", "least", "low"),
     [
         ("DICT_4X4_100", 0, 340.0, 76, 0.75),
-        ("DICT_4X4_100", 1, 340.0, 64, 0.75),
+        *slowly(("DICT_4X4_100", 1, 340.0, 64, 0.75)),
         # With a light of 340 the arithmetic of the processor decides whether 8 or 76 are found.
         (APRIL_FAMILY, 1, 342.0, 68, 0.5),
     ],
@@ -401,7 +403,7 @@ def test_circles_cut_by_the_border_are_right_where_a_filter_does_not_know_what_i
     ("design", "printed"),
     [
         (board("charuco", 9, 8, 24.0, size=18.0), prints.charuco(9, 8, 24.0, 18.0, "DICT_5X5_100")),
-        (board("chess", 14, 9, 18.0), prints.chess(14, 9, 18.0)),
+        *slowly((board("chess", 14, 9, 18.0), prints.chess(14, 9, 18.0))),
         (board("circles", 11, 8, 18.0, size=9.0), prints.circles(11, 8, 18.0, 9.0)),
     ],
     ids=["charuco", "chess", "circles"],
@@ -420,7 +422,7 @@ def test_errors_behind_a_fisheye_are_those_of_their_sigmas(
     assert np.abs(in_sigmas(found, error)).max() < 5
 
 
-@pytest.mark.parametrize("kind", ["charuco", "aprilgrid"])
+@pytest.mark.parametrize("kind", [*slowly("charuco"), "aprilgrid"])
 def test_markers_far_from_the_axis_of_a_fisheye_name_the_corners_of_a_board(kind: str) -> None:
     """No polynomial in the image by a projectivity describes it: 2 of 59 corners were found, off by 2 px."""
     if kind == "charuco":
@@ -455,7 +457,8 @@ def test_separate_markers_are_measured_to_the_margin_of_a_wide_view() -> None:
 
 
 @pytest.mark.parametrize(
-    ("condition", "seed"), [("gamma", 0), ("gamma", 2), ("motion6", 0), ("motion6", 3), ("overexposed", 0)]
+    ("condition", "seed"),
+    [("gamma", 0), ("motion6", 0), ("overexposed", 0), *slowly(("gamma", 2), ("motion6", 3))],
 )
 def test_corners_of_separate_tags_are_where_they_are_although_their_edges_are_shifted(
     condition: str, seed: int
@@ -478,7 +481,7 @@ def test_corners_of_separate_tags_are_where_they_are_although_their_edges_are_sh
     assert abs((error * out).sum(axis=1).mean()) < 0.3 * np.median(sigma)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *slowly(1, 2)])
 def test_the_curve_of_a_camera_is_learnt_from_few_circles(seed: int) -> None:
     """By residuals in other windows than those in which they were matched, and images by a rough mapping, it
     was not certain; positions were then 0.004 px aside in one direction, two sigmas.
@@ -494,7 +497,7 @@ def test_the_curve_of_a_camera_is_learnt_from_few_circles(seed: int) -> None:
 DELTILLE, DELTILLE_PRINT = board("deltille", 9, 8, 25.0), prints.Deltille(9, 8, 25.0)
 
 
-@pytest.mark.parametrize(("seed", "nearer", "blur"), [(0, 1.0, 0.7), (2, 0.8, 2.2)])
+@pytest.mark.parametrize(("seed", "nearer", "blur"), [(0, 1.0, 0.7), *slowly((2, 0.8, 2.2))])
 def test_corners_of_a_deltille_are_measured_to_their_sigmas_and_named(
     seed: int, nearer: float, blur: float
 ) -> None:
@@ -510,7 +513,8 @@ def test_corners_of_a_deltille_are_measured_to_their_sigmas_and_named(
     assert isinstance(chess, Failure)
 
 
-@pytest.mark.parametrize(("k", "least"), [pytest.param(0, 65, marks=pytest.mark.slow), (1, 22)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("k", "least"), [(0, 65), (1, 22)])
 def test_a_deltille_seen_at_60_degrees_is_numbered(k: int, least: int) -> None:
     """The directions of its edges are then too uneven for what finds corners seen from the front."""
     _, place = pose(90 + k, DELTILLE_PRINT, nearer=1.2)
@@ -701,7 +705,9 @@ def test_a_lattice_with_many_corners_missing_beside_it_is_declined() -> None:
         assert isinstance(found, Failure) != placed
 
 
-@pytest.mark.parametrize("hidden", [(slice(120, 260), slice(180, 330)), (slice(0, 400), slice(0, 230))])
+@pytest.mark.parametrize(
+    "hidden", [*slowly(((slice(120, 260), slice(180, 330)),)), (slice(0, 400), slice(0, 230))]
+)
 def test_something_over_a_part_hides_only_that_part(hidden: tuple[slice, slice]) -> None:
     for design in (CHESS, CHARUCO):
         frame, truth = picture(design, 20.0, 10.0)

@@ -11,6 +11,8 @@ from reseau.measure.reseau.assignment import assign
 from reseau.measure.reseau.candidates import Candidates
 from reseau.measure.reseau.grid_search import GridOptions, place_grid
 
+from ..montecarlo import slowly
+
 WIDTH, HEIGHT = 900, 700
 VALID = np.ones((HEIGHT, WIDTH), dtype=bool)
 
@@ -105,7 +107,7 @@ def test_missing_rows_and_a_hole_do_not_shift_the_names():
     assert (found.candidate[~there] >= 0).mean() < 0.2
 
 
-@pytest.mark.parametrize("row", [0, 8])
+@pytest.mark.parametrize("row", [*slowly(0), 8])
 def test_the_places_of_an_uneven_design_tell_which_row_at_the_border_is_not_seen(row):
     """Shifted by a row, as many marks are found, and one row lies largely beyond the frame."""
     rng = np.random.default_rng(9)

@@ -13,6 +13,8 @@ from reseau.measure.testfield.lattice import LatticeFit
 from reseau.measure.testfield.measure import TestfieldOptions
 from reseau_sims import FieldBench, Station
 
+from ..montecarlo import slowly
+
 
 def fitted(bench: FieldBench, station: Station) -> LatticeFit:
     found = measure_testfield(bench.record(station), bench.design, TestfieldOptions(fill=0.8))
@@ -37,7 +39,7 @@ def off_the_lines(bench: FieldBench, station: Station, fit: LatticeFit) -> Array
     return np.concatenate(found)
 
 
-@pytest.mark.parametrize("station", [Station(0), Station(30, 90), Station(45, 180, 37)])
+@pytest.mark.parametrize("station", [*slowly((Station(0),), (Station(30, 90),)), Station(45, 180, 37)])
 def test_lines_are_where_the_targets_say_to_a_hundredth_of_a_pixel(station: Station) -> None:
     bench = FieldBench(seed=2)
     fit = fitted(bench, station)

@@ -17,6 +17,7 @@ from reseau.measure import measure_reseau
 from reseau.measure.reseau.marks import ReseauOptions
 from reseau.measure.reseau.measure import misfit
 
+from ..montecarlo import slowly
 from .formed import MARKS, PX_PER_MM, Scene, form
 
 
@@ -45,7 +46,7 @@ def shown(pixels: Array) -> Frame:
     return Frame(np.ascontiguousarray(pixels), 255.0, "turned.png")
 
 
-@pytest.mark.parametrize("quarters", [0, 1, 2])
+@pytest.mark.parametrize("quarters", [2, *slowly(0, 1)])
 def test_a_regular_grid_is_found_at_any_turn_and_called_ambiguous(pixels, quarters):
     found = measure_reseau(shown(np.rot90(pixels, quarters)), SCENE.design()).required()
     assert found.found == 99
@@ -200,7 +201,7 @@ def plate_in_perspective(tilt_deg: float, pan_deg: float) -> tuple[Array, Array]
     return np.clip(np.rint(grey), 0, 255), at[:, :2] / at[:, 2:]
 
 
-@pytest.mark.parametrize("angles", [(30.0, 0.0), (20.0, 15.0)])
+@pytest.mark.parametrize("angles", [*slowly(((30.0, 0.0),)), (20.0, 15.0)])
 def test_a_regular_plate_in_perspective_is_not_numbered_a_row_or_column_off(angles):
     # Fields through the marks found first do not reach the last row: shifted by a row, 40 of 48 fit as well.
     grey, centres = plate_in_perspective(*angles)

@@ -22,6 +22,8 @@ from reseau.measure.pins.detection import PinOptions
 from reseau.measure.pins.wires import Wires, lay_wires
 from reseau.optics import Arcs
 
+from ..montecarlo import slowly
+
 GROUND, NOISE = 8.0, 2.55
 """Noise of 40 dB below full scale."""
 
@@ -208,8 +210,8 @@ def test_nothing_is_found_in_noise():
     assert not find_pins(frame(GROUND + NOISE * rng.standard_normal((300, 400)))).ok.any()
 
 
-@pytest.mark.parametrize("quality", [pytest.param(None, marks=pytest.mark.slow), 60])
-@pytest.mark.parametrize("scale", [0.4, 0.6, 1.0])
+@pytest.mark.parametrize("quality", [*slowly(None), 60])
+@pytest.mark.parametrize("scale", [0.4, *slowly(0.6), 1.0])
 def test_graphics_of_the_instrument_are_not_measured_as_pins(scale: float, quality: int | None):
     truth = np.array([[100.3, 160.2], [300.0, 160.0]])
     pixels = picture(truth, arcs(2, 9.0), (250, 480), noise=0.0).astype(np.uint8)
@@ -289,8 +291,7 @@ def on_screen(matrix: Array) -> Array:
 @pytest.mark.parametrize(
     "matrix",
     [
-        *(pytest.param(m, marks=pytest.mark.slow) for m in ([[5, 0], [0, -5]], [[-5, 0], [0, 5]])),
-        [[-5, 0], [0, -5.2]],
+        *slowly([[5, 0], [0, -5]], [[-5, 0], [0, 5]], [[-5, 0], [0, -5.2]]),
         [[4.95, -0.5], [-0.5, -4.95]],
     ],
 )

@@ -19,6 +19,7 @@ from reseau.measure.reseau.measure import ReseauResult
 from reseau.optics.formation import Outline, PixelResponse, coverage_derivatives, draw, mark_outline
 from reseau.optics.sensor import sigma_of_snr
 
+from ..montecarlo import slowly
 from .formed import MARKS, Scene, bounds, form, measure_many, measured
 
 SMALL = Scene(columns=8, rows=6, width=460, height=350)
@@ -113,7 +114,7 @@ def test_the_bound_agrees_with_an_independent_estimator():
     assert known_all_else <= bound < 1.2 * known_all_else
 
 
-@pytest.mark.parametrize("shape", ["disk", "cross", "line-grid"])
+@pytest.mark.parametrize("shape", ["disk", "cross", *slowly("line-grid")])
 def test_an_absent_mark_is_never_measured_and_the_reason_is_given(shape):
     for seed, sigma in ((0, 2.5), (2, 8.0)):
         gone = frozenset(rng(seed).choice(48, 14, replace=False).tolist())

@@ -26,6 +26,7 @@ from reseau_sims import FieldBench, Stain, Station
 from reseau_sims.testfield import DISTANCE_MM, JITTER_PX
 
 from .. import kept
+from ..montecarlo import slowly
 from .fields import bounds
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -50,7 +51,7 @@ def test_row_jitter_increases_the_bound_of_x_by_a_third() -> None:
     assert np.sqrt(variance[0] / variance[1]) == pytest.approx(1.3, abs=0.01)
 
 
-@pytest.mark.parametrize("station", [Station(0), Station(45, 90, 180), Station(60, 180, 90)])
+@pytest.mark.parametrize("station", [*slowly((Station(0),), (Station(45, 90, 180),)), Station(60, 180, 90)])
 def test_targets_are_numbered_and_measured_at_the_cramer_rao_bound(station: Station) -> None:
     bench = FieldBench(seed=11)
     result, error = measured(bench, station)
@@ -82,12 +83,9 @@ CASES: dict[str, tuple[FieldBench, Station, int]] = {
     "from afar": (FieldBench(distance_mm=8000), Station(0), 760),
 }
 QUICK = (
-    "the camera turned by 37°",
-    "barrel distortion of 10 px",
-    "blurred by 2 px",
-    "uneven light",
-    "from afar",
-)
+    "the camera turned by 37°", "barrel distortion of 10 px", "blurred by 2 px", "uneven light",
+    "from afar"
+)  # fmt: skip
 """What the suite measures; the others take as long, and are run by `make slow`."""
 
 
@@ -293,7 +291,7 @@ def test_a_testfield_is_found_beside_a_larger_one_whose_code_begins_alike() -> N
     np.testing.assert_allclose(found.xy - [frames[0].shape[1], 0], alone.xy, rtol=0, atol=0.01)
 
 
-@pytest.mark.parametrize("condition", [pytest.param("gamma", marks=pytest.mark.slow), "sharpened", "jpeg60"])
+@pytest.mark.parametrize("condition", [*slowly("gamma", "sharpened"), "jpeg60"])
 def test_cameras_that_process_their_pictures_leave_sigmas_of_the_size_of_errors(condition: str) -> None:
     """Residuals are then larger than noise, but displace targets less."""
     design = coded_testfield()

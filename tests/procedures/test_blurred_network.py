@@ -25,6 +25,7 @@ from reseau.procedures.blurred_network import (
     measure_blurred_network,
 )
 
+from ..montecarlo import slowly
 from . import underwater
 
 LENS_F = abs(Paraxial(underwater.LENS).focal_length)
@@ -101,7 +102,7 @@ def test_reduced_coordinates_depend_on_the_direction_from_the_projection_centre_
     assert np.abs(reduction[rows]).max() > 1e-4
 
 
-@pytest.mark.parametrize("method", ["centroid", "edge"])
+@pytest.mark.parametrize("method", [*slowly("centroid"), "edge"])
 def test_ordinary_coordinates_can_be_measured(method: Any) -> None:
     project = drawn()
     rough = replace(project.network, xy=np.round(project.true / 4) * 4)

@@ -55,6 +55,7 @@ def errors(found: ImagePoints, world: World) -> np.ndarray:
     return found.xy - truth.object_xy[row]
 
 
+@pytest.mark.slow
 def test_a_bench_without_faults_gives_no_remarks(bench):
     _, second = bench
     assert second.notes == ()

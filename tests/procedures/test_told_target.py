@@ -22,6 +22,7 @@ from reseau.procedures.which_target import corrected
 
 from .. import kept
 from ..measure.board_pictures import picture
+from ..montecarlo import slowly
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from worlds import prints
@@ -56,15 +57,13 @@ def measured(printed: BoardDesign, told: BoardDesign) -> TargetMeasured:
     ("printed", "told", "said"),
     [
         (CHESS, {"columns": 8, "rows": 7}, "columns 7 in place of 8, rows 6 in place of 7"),
-        (CHARUCO, {"dictionary": "DICT_4X4_50"}, "dictionary DICT_5X5_50 in place of DICT_4X4_50"),
-        (LEGACY, {"legacy": False}, "legacy True in place of False"),
         (APRIL, {"pitch": 40.0}, "in other proportions than was told: pitch 30.0 in place of 40.0"),
-        (CIRCLES, {"rows": 4}, "rows 5 in place of 4; calibrated"),
-        (SHIFTED, {"columns": 2}, "columns 3 in place of 2; calibrated"),
         (CIRCLES.model_copy(update={"polarity": "bright"}), {"polarity": "dark"}, "bright in place of dark"),
-        *(
-            pytest.param(*each, marks=pytest.mark.slow)
-            for each in (
+        *slowly(
+                (CHARUCO, {"dictionary": "DICT_4X4_50"}, "dictionary DICT_5X5_50 in place of DICT_4X4_50"),
+                (LEGACY, {"legacy": False}, "legacy True in place of False"),
+                (CIRCLES, {"rows": 4}, "rows 5 in place of 4; calibrated"),
+                (SHIFTED, {"columns": 2}, "columns 3 in place of 2; calibrated"),
                 (CHESS, {"columns": 6, "rows": 5}, "columns 7 in place of 6, rows 6 in place of 5"),
                 (CHARUCO, {"columns": 6, "rows": 7}, "columns 7 in place of 6, rows 6 in place of 7"),
                 (CHARUCO, {"rows": 5}, "rows 6 in place of 5; calibrated"),
@@ -76,7 +75,6 @@ def measured(printed: BoardDesign, told: BoardDesign) -> TargetMeasured:
                 (LONG, {"rows": 6}, "rows 7 in place of 6; calibrated"),
                 (CIRCLES, {"columns": 6}, "columns 7 in place of 6; calibrated"),
                 (SHIFTED, {"rows": 4}, "rows 5 in place of 4; calibrated"),
-            )
         ),
     ],
 )  # fmt: skip

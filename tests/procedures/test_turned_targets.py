@@ -17,6 +17,8 @@ from reseau.procedures.exposures import Taken
 from reseau.procedures.target_measurement import MeasuredPhotograph, Photograph
 from reseau.procedures.told_target import ways_to_turn
 
+from ..montecarlo import slowly
+
 SIGMA, TRUE = 0.01, {"fx": 700.0, "fy": 702.0, "cx": 402.0, "cy": 297.0}
 SIZE = (800, 600)
 
@@ -50,16 +52,14 @@ def photographs(design: BoardDesign, print_mm: float, shifted: int = 0) -> list[
     return found
 
 
-@pytest.mark.parametrize(
-    "print_mm", [0.03, *(pytest.param(each, marks=pytest.mark.slow) for each in (0.0, 0.15))]
-)
+@pytest.mark.parametrize("print_mm", [0.03, *slowly(0.0, 0.15)])
 @pytest.mark.parametrize(
     ("design", "ways"),
     [
         (board("circles", 7, 10, 20.0), 2),
         (board("circles", 9, 9, 20.0), 4),
         (board("circles", 4, 10, 15.0, asymmetric=True), 2),
-        (board("chess", 8, 10, 20.0), 2),
+        *slowly((board("chess", 8, 10, 20.0), 2)),
     ],
     ids=["circles", "square", "asymmetric", "chess"],
 )
@@ -77,7 +77,7 @@ def test_photographs_that_name_points_differently_give_the_accuracy_of_those_tha
             assert abs(value - TRUE[name]) < 4 * sigma < 0.6
 
 
-@pytest.mark.parametrize("design", [board("chess", 7, 10, 20.0), board("circles", 7, 10, 20.0)])
+@pytest.mark.parametrize("design", [*slowly(board("chess", 7, 10, 20.0)), board("circles", 7, 10, 20.0)])
 def test_photographs_of_a_part_that_name_its_points_shifted_are_named_alike(design: BoardDesign) -> None:
     two_rows = 2 * (6 if design.kind == "chess" else 7)
     images = photographs(design, 0.1, two_rows)

@@ -16,15 +16,9 @@ def _coefficients(causes: dict[str, float]) -> np.ndarray:
     """The paper's equations between (6) and (7), typed from its list."""
     c = causes
     a = [
-        c["P0"],
-        1 + c["k0"] + c["m1"],
-        c["m2"] - c["P3"],
-        c["P1"],
-        c["P2"] - c["h'1"],
-        -c["h'1"],
-        c["k1"],
-        -c["h'2"],
-    ]
+        c["P0"], 1 + c["k0"] + c["m1"], c["m2"] - c["P3"], c["P1"], c["P2"] - c["h'1"], -c["h'1"], c["k1"],
+        -c["h'2"]
+    ]  # fmt: skip
     b = [c["P4"], 1 + c["k0"], c["P3"], c["P2"], c["P1"] + c["h'3"], c["h'3"], c["k1"], c["h'4"]]
     return np.array(a + b)
 

@@ -57,15 +57,9 @@ def defined(tmp_path_factory: pytest.TempPathFactory) -> Path:
             known = Configurations(archive)
             known.review("left", known.history("left")[0].key, "accepted", comment="first")
         define = [
-            "recalibrate",
-            "left",
-            "--repeats",
-            "first",
-            "--configuration",
-            "left",
-            "--rules",
-            "rules.json",
-        ]
+            "recalibrate", "left", "--repeats", "first", "--configuration", "left", "--rules",
+            "rules.json"
+        ]  # fmt: skip
         assert run(define) == 0
     return folder
 

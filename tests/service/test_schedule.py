@@ -18,13 +18,8 @@ from reseau.service import Configurations, Run, Schedule, Schedules
 from reseau.service.schedule import CalendarEvent, Recurrence, calendar_feed
 
 ZONES = (
-    "UTC",
-    "Europe/Berlin",
-    "America/New_York",
-    "Australia/Lord_Howe",
-    "Asia/Kolkata",
-    "America/Sao_Paulo",
-)
+    "UTC", "Europe/Berlin", "America/New_York", "Australia/Lord_Howe", "Asia/Kolkata", "America/Sao_Paulo"
+)  # fmt: skip
 DAYS = ("MO", "TU", "WE", "TH", "FR", "SA", "SU")
 
 

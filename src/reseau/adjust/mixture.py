@@ -8,6 +8,7 @@ nothing is explained, misfits are anywhere within the largest.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,18 +47,18 @@ class Mixture:
     reach: float
     components: int = 2
 
-    def _logarithms(self, size: Array, sigma: Array | None = None) -> tuple[Array, Array]:
+    def _logarithms(self, size: Array, sigma: Array | float | None = None) -> tuple[Array, Array]:
         """Logarithms of the densities of good and of gross misfits, times their shares."""
-        d, s = self.components, np.asarray(self.sigma if sigma is None else sigma)
-        sphere = 2 * np.pi ** (d / 2) / scipy.special.gamma(d / 2)
+        d, s = self.components, self.sigma if sigma is None else sigma
+        sphere = 2 * np.pi ** (d / 2) / math.gamma(d / 2)
         span = np.log(np.maximum(self.reach / s, 1.0)) + 1 / d
-        r = np.minimum(np.nan_to_num(size, nan=self.reach, posinf=self.reach), self.reach)
-        good = np.log1p(-self.share) - d / 2 * np.log(2 * np.pi * s**2) - 0.5 * (r / s) ** 2
-        good = np.where(np.isfinite(size), good, -np.inf)
-        gross = np.log(self.share) - np.log(sphere * span) - d * np.log(np.maximum(r, s))
-        return good, gross
+        finite = np.isfinite(size)
+        r = np.where(finite, np.minimum(size, self.reach), self.reach)
+        good = math.log1p(-self.share) - d / 2 * np.log(2 * np.pi * s**2) - 0.5 * (r / s) ** 2
+        gross = math.log(self.share) - np.log(sphere * span) - d * np.log(np.maximum(r, s))
+        return np.where(finite, good, -np.inf), gross
 
-    def good(self, size: Array, sigma: Array | None = None) -> Array:
+    def good(self, size: Array, sigma: Array | float | None = None) -> Array:
         """Return the probability that each misfit is that of a good observation, with `sigma` of its own."""
         good, gross = self._logarithms(size, sigma)
         return np.asarray(scipy.special.expit(good - gross), dtype=np.float64)
@@ -65,8 +66,8 @@ class Mixture:
     def evidence(self, size: Array, sigma: Array | None = None) -> Array:
         """Return by how much each misfit is better explained than by a place anywhere (logarithm)."""
         d = self.components
-        ball = np.pi ** (d / 2) / scipy.special.gamma(d / 2 + 1) * self.reach**d
-        return np.asarray(np.logaddexp(*self._logarithms(size, sigma)) + np.log(ball), dtype=np.float64)
+        ball = np.pi ** (d / 2) / math.gamma(d / 2 + 1) * self.reach**d
+        return np.asarray(np.logaddexp(*self._logarithms(size, sigma)) + math.log(ball), dtype=np.float64)
 
     @property
     def price(self) -> float:
@@ -111,9 +112,10 @@ class Mixture:
 
         `parameters` have been chosen by the misfits of each trial.
         """
-        sums = [self.evidence(size, s).sum(axis=-1) - parameters * self.prices(s) for s in sigmas]
+        each = sigmas.reshape(-1, *[1] * size.ndim)
+        sums = self.evidence(size, each).sum(axis=-1) - parameters * self.prices(each[..., 0])
         best = np.argmax(sums, axis=0)
-        return np.take_along_axis(np.array(sums), best[None], axis=0)[0], np.asarray(sigmas)[best]
+        return np.take_along_axis(sums, best[None], axis=0)[0], sigmas[best]
 
     def gross(self, size: Array, sigma: Array | None = None) -> Mask:
         """Whether each misfit is more probably a gross error."""

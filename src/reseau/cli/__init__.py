@@ -5,11 +5,14 @@ Modules of commands import other packages inside the commands, so that help and 
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
+from functools import cache
 from typing import Annotated, Any
 
 import typer
+from typer.main import get_command
 
 from ..core.errors import ReseauError
 from ..core.notice import before_compiling
@@ -43,6 +46,8 @@ from .declared import Commands
 __all__ = ["app", "main"]
 
 _COMPILING = "compiling for this processor, once, what this command calls; `reseau compile` does it ahead"
+_COLLECTING = (50_000, 20, 20)
+"""When circles of objects are looked for: seldom: modules are most of what a command makes."""
 
 app = Commands(
     name="reseau",
@@ -113,7 +118,10 @@ def _options(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: 0 success, 1 failure, 2 usage error; errors in one line on stderr."""
-    sys.exit(run(arguments))
+    gc.set_threshold(*_COLLECTING)
+    status = run(arguments)
+    gc.freeze()  # what is left ends with the process
+    sys.exit(status)
 
 
 def run(arguments: list[str] | None = None) -> int:
@@ -121,7 +129,7 @@ def run(arguments: list[str] | None = None) -> int:
     if sys.stderr.isatty():
         before_compiling(lambda: print(_COMPILING, file=sys.stderr))
     try:
-        return int(app(arguments, standalone_mode=False) or 0)
+        return int(_command()(arguments, standalone_mode=False) or 0)
     except ReseauError as error:
         return _report(str(error), error.exit_status)
     except ModuleNotFoundError as error:
@@ -141,6 +149,12 @@ def run(arguments: list[str] | None = None) -> int:
             raise
         said = str(format_message()).replace("Value error, ", "")  # of pydantic
         return _report(said or "see `reseau --help`", int(getattr(error, "exit_code", 2)))
+
+
+@cache
+def _command() -> Any:
+    """What Typer makes of all commands."""
+    return get_command(app)
 
 
 def _report(message: str, status: int) -> int:

@@ -28,22 +28,6 @@ from ..io import FiducialDesign, FiducialMark, FiducialPoint, MarkPart
 _CORNERS = {"1": (-1, -1), "2": (1, 1), "3": (-1, 1), "4": (1, -1)}
 _MIDDLES = {"5": (-1, 0), "6": (1, 0), "7": (0, 1), "8": (0, -1)}
 
-_CROSS = MarkPart(shape="cross", size=3.86, line_width=0.1, gap=0.7)
-_CIRCLE = (
-    MarkPart(shape="ring", size=1.9, line_width=0.18),
-    MarkPart(shape="cross", size=3.45, line_width=0.05, gap=0.57),
-)
-_TOP = (
-    MarkPart(shape="disk", size=0.155),
-    MarkPart(shape="ring", size=1.85, line_width=0.3),
-    MarkPart(shape="cross", size=2.15, line_width=0.155, gap=0.62),
-)
-_MARKS = {
-    "cross": FiducialMark(polarity="bright", parts=(_CROSS,), margin=0.6),
-    "circle": FiducialMark(polarity="bright", parts=_CIRCLE, margin=0.5),
-    "top": FiducialMark(polarity="bright", parts=_TOP, margin=0.4),
-    "dot": FiducialMark(polarity="bright", parts=(MarkPart(shape="disk", size=0.2),), margin=0.7),
-}
 _USGS = "nominal, beside {} USGS calibration reports"
 _LMK = "nominal, beside USGS report OSL/1551; the form of the marks is not published"
 _CAMERAS: dict[str, tuple[str, float, tuple[str, float] | None, tuple[str, float] | None, str]] = {
@@ -125,7 +109,8 @@ def aerial_camera(name: str) -> FiducialDesign:
         if marked is None:
             continue
         mark, away = marked
-        marks[mark] = _MARKS[mark]
+        margin, *parts = _marks()[mark]
+        marks[mark] = FiducialMark(polarity="bright", parts=tuple(parts), margin=margin)
         # The arms of crosses in the corners point along the diagonals.
         turn = 45.0 if places is _CORNERS else 0.0
         points += [
@@ -133,3 +118,22 @@ def aerial_camera(name: str) -> FiducialDesign:
             for key, (x, y) in places.items()
         ]
     return FiducialDesign(name=title, source=source, marks=marks, points=tuple(points))
+
+
+def _marks() -> dict[str, tuple[float, MarkPart, *tuple[MarkPart, ...]]]:
+    """Margins and parts of marks."""
+    return {
+        "cross": (0.6, MarkPart(shape="cross", size=3.86, line_width=0.1, gap=0.7)),
+        "circle": (
+            0.5,
+            MarkPart(shape="ring", size=1.9, line_width=0.18),
+            MarkPart(shape="cross", size=3.45, line_width=0.05, gap=0.57),
+        ),
+        "top": (
+            0.4,
+            MarkPart(shape="disk", size=0.155),
+            MarkPart(shape="ring", size=1.85, line_width=0.3),
+            MarkPart(shape="cross", size=2.15, line_width=0.155, gap=0.62),
+        ),
+        "dot": (0.7, MarkPart(shape="disk", size=0.2)),
+    }

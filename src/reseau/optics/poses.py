@@ -37,18 +37,22 @@ def cross_matrix(vectors: Array) -> Array:
     return matrix
 
 
-def _coefficients(theta: Array) -> tuple[Array, Array, Array]:
-    """sin θ/θ, (1 − cos θ)/θ² and (θ − sin θ)/θ³, exact at θ → 0."""
-    a = np.sinc(theta / np.pi)
-    b = 0.5 * np.sinc(theta / (2 * np.pi)) ** 2
+def _sines(theta: Array) -> tuple[Array, Array]:
+    """sin θ/θ and (1 − cos θ)/θ², exact at θ → 0."""
+    half = 0.5 * np.where(theta == 0, 1e-20, theta)
+    b = np.sin(half) / half
+    return b * np.cos(half), 0.5 * b**2
+
+
+def _third(theta: Array) -> Array:
+    """(θ − sin θ)/θ³, exact at θ → 0."""
     square = np.minimum(theta, _SMALL_ANGLE) ** 2
     series = np.zeros_like(theta)
     # 1/3! − θ²/5! + θ⁴/7! …; at 0.5 rad the next term is below 1e-19.
     for factor in (14 * 15, 12 * 13, 10 * 11, 8 * 9, 6 * 7, 4 * 5):
         series = (1 - series) * square / factor
     small = theta < _SMALL_ANGLE
-    c = np.where(small, (1 - series) / 6, (theta - np.sin(theta)) / np.where(small, 1.0, theta) ** 3)
-    return a, b, c
+    return np.where(small, (1 - series) / 6, (theta - np.sin(theta)) / np.where(small, 1.0, theta) ** 3)
 
 
 def rotation_matrix(r: ArrayLike) -> Array:
@@ -63,7 +67,7 @@ def rotation_matrix(r: ArrayLike) -> Array:
     """
     vectors = np.asarray(r, dtype=np.float64)
     theta = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    a, b, _ = _coefficients(theta)
+    a, b = _sines(theta)
     k = cross_matrix(vectors)
     return np.eye(3) + a * k + b * (k @ k)
 
@@ -95,7 +99,7 @@ def rotate(r: ArrayLike, vectors: ArrayLike) -> tuple[Array, Array]:
     """
     rotation, x = np.asarray(r, dtype=np.float64), np.asarray(vectors, dtype=np.float64)
     theta = np.linalg.norm(rotation, axis=-1)[..., None, None]
-    _, b, c = _coefficients(theta)
+    b, c = _sines(theta)[1], _third(theta)
     k = cross_matrix(rotation)
     jacobian = np.eye(3) - b * k + c * (k @ k)
     matrix = rotation_matrix(rotation)

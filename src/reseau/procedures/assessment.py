@@ -148,7 +148,7 @@ def _because(causes: tuple[Cause, ...]) -> str:
             f"the model fits, and image points scatter {first.form} as much as their standard deviations say"
         )
     alike = [cause for cause in causes[1:] if cause.instead]
-    text = ", or ".join(described(cause.code) for cause in (first, *alike))
+    text = ", or ".join(described(cause.code, cause.form) for cause in (first, *alike))
     text += f" ({two_digits(first.amount_px)} px of the residuals"
     text += f"; {first.where})" if first.where else ")"
     return f"{text}: {first.do}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
@@ -183,6 +183,12 @@ class Calibrated(Estimated, Display):
     def explanation(self) -> Explanation:
         """What is wrong, if anything."""
         return explain(self.result, self.misnamed)
+
+    def described(self, **changes: Any) -> Calibrated:
+        """The same result with other notes, names or files; what is wrong with it is not looked for again."""
+        found = replace(self, **changes)
+        found.__dict__.update({k: each for k, each in self.__dict__.items() if k == "explanation"})
+        return found
 
     @cached_property
     def assessments(self) -> dict[str, Assessment]:

@@ -108,7 +108,7 @@ def calibrate_photographs(
     if isinstance(done, Failure):
         return done
     sources = {name: source for name, source in photographs if isinstance(source, Path)}
-    return replace(done, notes=(*notes, *done.notes), target=design.name, sources=sources, channel=channel)
+    return done.described(notes=(*notes, *done.notes), target=design.name, sources=sources, channel=channel)
 
 
 def _shown(photographs: Iterator[Photograph], step: Callable[[str], None]) -> Iterator[Photograph]:

@@ -153,11 +153,11 @@ def calibrate_camera(
             alike = named_alike(done.measured, design, lenses)
             if all(points.names == done.measured[image].names for image, points in alike.items()):
                 break
-            again = job.calibrated(alike)
+            again = job.adjusted(alike, done.misnamed, done.result.network.cameras)
             if isinstance(again, Failure) or again.sigma0 > _BETTER * done.sigma0:
                 break
-            done = again
-    return done if isinstance(done, Failure) else replace(done, corrected=seen.corrected)
+            done = job.calibrated(alike)
+    return done if isinstance(done, Failure) else done.described(corrected=seen.corrected)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,16 +200,16 @@ class _Job:
         stand_in = Camera(ONE_CAMERA, 1, 1, (1.0, 1.0), "opencv", np.zeros(len(camera_model("opencv").names)))
         wrong = left_out(network_of(measured, design, stand_in), cameras, sizes, of)
         if wrong is None:
-            return self._decided(self._adjusted(measured, None), measured, None)
+            return self._decided(self.adjusted(measured, None), measured, None)
         # Which points are wrong is seen best with the target as designed: its errors are small beside theirs.
         more = options.target != "free" or options.control or options.heights or options.refraction
         first = self if more else replace(self, options=replace(options, target="flat"))
-        done = first._adjusted(wrong.kept(measured), wrong.found)
+        done = first.adjusted(wrong.kept(measured), wrong.found)
         still = wrong if isinstance(done, Failure) else wrong.after(done.result)
         same = still is not None and np.array_equal(still.found.rows, wrong.found.rows)
         kept, found = (measured, None) if still is None else (still.kept(measured), still.found)
         if not same or not more:
-            done = self._adjusted(kept, found)
+            done = self.adjusted(kept, found)
         elif not isinstance(done, Failure):
             done = replace(done, misnamed=found)
         return self._decided(done, kept, found)
@@ -218,20 +218,30 @@ class _Job:
         self, done: Calibrated | Failure, measured: dict[str, ImagePoints], wrong: Misnamed | None
     ) -> Calibrated | Failure:
         """What was adjusted from the points; without gross errors where these explain what is left."""
-        if isinstance(done, Failure) or self.options.reject is not None:
+        if self.options.reject is not None:
             return done
-        causes = done.explanation.causes
-        if not causes or causes[0].code != "blunders":
+        if isinstance(done, Failure):
+            wrong_points = done.code is Code.NOT_CONVERGED
+        else:
+            wrong_points = [cause.code for cause in done.explanation.causes[:1]] == ["blunders"]
+        if not wrong_points:
             return done
-        without = replace(self, options=replace(self.options, reject=True))._adjusted(measured, wrong)
+        without = replace(self, options=replace(self.options, reject=True)).adjusted(measured, wrong)
         if isinstance(without, Failure):
             return done
         rows = np.flatnonzero(without.result.rejected)
+        if not len(rows):
+            return without
         said = _LEFT_OUT.format(len(rows), in_images(without.result.network, rows))
         return replace(without, notes=(*without.notes, said))
 
-    def _adjusted(self, measured: dict[str, ImagePoints], wrong: Misnamed | None) -> Calibrated | Failure:
-        """Adjust the points of photographs, of which those that are wrong were left out."""
+    def adjusted(
+        self, measured: dict[str, ImagePoints], wrong: Misnamed | None, known: tuple[Camera, ...] = ()
+    ) -> Calibrated | Failure:
+        """Adjust the points of photographs, of which those that are wrong were left out.
+
+        Models of cameras that are known are not chosen again.
+        """
         design, sizes, options, taken = self.design, self.sizes, self.options, self.taken
         notes, adjustment = self.notes, options.adjustment
         if options.reject is not None:
@@ -269,7 +279,9 @@ class _Job:
             network = replace(network, cov=np.tile(np.eye(2) * options.sigma_px**2, (len(network.xy), 1, 1)))
         choices = dict[str, ModelChoice]()
         # With all points free: what is wrong with a target must not choose the model of the lens.
-        if model.automatic:
+        if known:
+            network = replace(network, cameras=known)
+        elif model.automatic:
             chosen = choose_models(network, options=adjustment)
             if isinstance(chosen, Failure):
                 notes = (

@@ -12,6 +12,7 @@ from reseau.core.data import Frame
 from reseau.instruments import Instrument, Turntable
 from reseau_sims import FieldBench, Station
 
+from ... import kept
 from ...capture.fieldrig import AXES
 from ...capture.simple import CameraSettings, Simple, Taken
 
@@ -47,7 +48,7 @@ class FieldCamera(Simple):
             os.abort()
         self._number += 1
         at = [self._table.state(axis).position for axis in AXES]
-        frame = self._field.record(Station(*at))
+        frame = kept.once(FieldBench.record, self._field, Station(*at))
         pixels = (frame.pixels * min(1.0, self.settings.exposure_us / 1000.0)).astype(frame.pixels.dtype)
         return Taken(Frame(pixels, 255.0), self._number, datetime.now(UTC), self.settings.exposure_us)
 

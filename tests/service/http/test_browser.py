@@ -50,13 +50,8 @@ class Place:
         log = (self.folder / "serve.log").open("a")
         before = (self.folder / "serve.log").stat().st_size
         command = [
-            sys.executable,
-            "-c",
-            "from reseau.cli import main; main()",
-            "serve",
-            "--bench",
-            "bench.toml",
-        ]
+            sys.executable, "-c", "from reseau.cli import main; main()", "serve", "--bench", "bench.toml"
+        ]  # fmt: skip
         self.running = subprocess.Popen(
             [*command, "--port", str(self.port)], cwd=self.folder, env=self.environment, stderr=log, text=True
         )

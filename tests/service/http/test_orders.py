@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -69,6 +67,7 @@ def test_recalibrate_now_runs_on_the_bench_of_the_service_with_its_log(defined: 
     assert state(client, "ready")["session"]["by"] == found["by"]
 
 
+@pytest.mark.slow
 def test_the_command_line_and_a_schedule_ask_the_service_that_holds_the_bench(
     defined: Served,
     rig: Rig,  # noqa: F811
@@ -94,23 +93,18 @@ def test_the_command_line_and_a_schedule_ask_the_service_that_holds_the_bench(
 def test_a_capture_of_the_command_line_is_carried_out_by_the_service_that_holds_the_bench(
     defined: Served,
     rig: Rig,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    command = [
-        sys.executable,
-        "-c",
-        "from reseau.cli import main; main()",
-        "capture",
-        "frames",
-        "--count",
-        "2",
-    ]
-    done = subprocess.run([*command, "--name", "by hand"], cwd=rig.folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert "holds bench cellar" in done.stderr
-    assert "by hand: done, 2 frames" in done.stdout
-    again = subprocess.run([*command, "--name", "by hand"], cwd=rig.folder, capture_output=True, text=True)
-    assert again.returncode == 2
-    assert len([line for line in again.stderr.splitlines() if line.startswith("reseau:")]) == 1
+    monkeypatch.chdir(rig.folder)
+    monkeypatch.syspath_prepend(rig.folder / "drivers")
+    words = ["capture", "frames", "--count", "2", "--name", "by hand"]
+    assert run(words) == 0
+    printed = capsys.readouterr()
+    assert "holds bench cellar" in printed.err
+    assert "by hand: done, 2 frames" in printed.out
+    assert run(words) == 2
+    assert capsys.readouterr().err.count("reseau:") == 1
 
 
 def test_a_paused_queue_is_put_in_order_and_withdrawn(defined: Served) -> None:

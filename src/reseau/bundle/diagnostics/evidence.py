@@ -170,13 +170,17 @@ class Scores:
         return float(self._log_density(np.array([self.square]), known)[0]) + self.log_density
 
     def _log_density(self, quad: Array, known: float = 0.5) -> Array:
-        """Log density of residuals with this sum of squares: of a mixture of σ² = 1 and σ² unknown."""
-        half = self.redundancy / 2
-        quad = np.maximum(quad, 1e-300)
+        """Log density of residuals with this sum of squares: of a mixture of σ² = 1 and σ² unknown.
+
+        Sums that are not positive have lost their digits, and have none.
+        """
+        half, found = self.redundancy / 2, np.full(quad.shape, -np.inf)
+        possible = quad > 0
+        quad = quad[possible]
         free = scipy.special.gammaln(half) + half * np.log(2.0) - half * np.log(quad) - np.log(_LOG_RANGE)
         share = known
         with np.errstate(divide="ignore"):
-            found: Array = np.logaddexp(-0.5 * quad + np.log(share), free + np.log1p(-share))
+            found[possible] = np.logaddexp(-0.5 * quad + np.log(share), free + np.log1p(-share))
         return found
 
     def log_profile(self, sizes: Array) -> Array:
@@ -210,9 +214,7 @@ class Scores:
     def before(self, effects: Array) -> Scores:
         """The scores without these effects (k,), which were taken into account when they were computed."""
         more = self.m @ effects
-        return replace(
-            self, g=self.g + more, square=max(self.square + float(effects @ (2 * self.g + more)), 1e-300)
-        )
+        return replace(self, g=self.g + more, square=self.square + float(effects @ (2 * self.g + more)))
 
     def with_effects(self, columns: Rows, size: float | Array) -> Scores:
         """The scores after effects of this size, or these sizes (k,), were taken into account."""

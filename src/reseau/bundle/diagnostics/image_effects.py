@@ -16,6 +16,8 @@ _LENGTHS = (0.3, 0.6, 1.2)
 """Distances, in half the diagonal of the image, over which displacements of an image are alike."""
 _DEGREE, _NODES = 4, 12
 """Degree of the polynomials that describe a smooth field, and nodes of the integration over the image."""
+_CREASES, _OF_CREASES = (0.15, 0.3, 0.6), 6
+"""Distances, in half the diagonal of a target, over which heights are alike; degree of their polynomials."""
 
 
 def smooth_effects(fit: BundleFit, degree: int = _DEGREE) -> tuple[Effect, dict[str, Array]]:
@@ -24,7 +26,7 @@ def smooth_effects(fit: BundleFit, degree: int = _DEGREE) -> tuple[Effect, dict[
     The coefficients of polynomials that are orthonormal over the image have the covariance that follows from
     that of the field.
     """
-    powers = [(i, d - i) for d in range(degree + 1) for i in range(d + 1)]
+    powers = _powers(degree)
     count = len(powers)
     network, rows = fit.problem.network, used_rows(fit)
     image = network.image_of[rows]
@@ -41,6 +43,23 @@ def smooth_effects(fit: BundleFit, degree: int = _DEGREE) -> tuple[Effect, dict[
             both[k, :count, :count] = both[k, count:, count:] = _root(half, length, powers)
         forms[f"{length:g}"] = both[of.ravel()]
     return Effect(slope, image, len(network.images)), forms
+
+
+def creases(fit: BundleFit, flat: Array, slope: Array) -> tuple[Effect, dict[str, Array]]:
+    """Smooth displacements over a plane target, others in each image, and their forms, (images, q, q).
+
+    `flat` are the used image points in the plane of the target (n, 2), and `slope` what one unit of each kind
+    of displacement there does to them (n, 2, k).
+    """
+    powers = _powers(_OF_CREASES)
+    network = fit.problem.network
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    over = _polynomials(2 * (flat - low) / (high - low) - 1, powers)
+    kinds, half, images = slope.shape[2], (high - low) / np.hypot(*(high - low)), len(network.images)
+    columns = (slope[:, :, :, None] * over[:, None, None, :]).reshape(len(flat), 2, -1)
+    roots = {f"{length:g}": np.kron(np.eye(kinds), _root(half, length, powers)) for length in _CREASES}
+    forms = {name: np.tile(root, (images, 1, 1)) for name, root in roots.items()}
+    return Effect(columns, network.image_of[used_rows(fit)], images), forms
 
 
 def distance_effects(fit: BundleFit) -> Effect:
@@ -76,10 +95,16 @@ def point_effects(fit: BundleFit) -> Effect | None:
     return Effect(slope, group, len(seen))
 
 
+def _powers(degree: int) -> list[tuple[int, int]]:
+    """Degrees along both axes of the polynomials of two coordinates."""
+    return [(i, d - i) for d in range(degree + 1) for i in range(d + 1)]
+
+
 def _polynomials(at: Array, powers: Sequence[tuple[int, int]]) -> Array:
     """Products of Legendre polynomials, orthonormal over the square from −1 to 1 (n, k)."""
-    x, y = (np.polynomial.legendre.legvander(np.clip(axis, -1.5, 1.5), _DEGREE) for axis in at.T)
-    norm = np.sqrt(2 * np.arange(_DEGREE + 1) + 1)
+    degree = max(i + j for i, j in powers)
+    x, y = (np.polynomial.legendre.legvander(np.clip(axis, -1.5, 1.5), degree) for axis in at.T)
+    norm = np.sqrt(2 * np.arange(degree + 1) + 1)
     return np.stack([x[:, i] * norm[i] * y[:, j] * norm[j] for i, j in powers], axis=1)
 
 

@@ -17,7 +17,7 @@ from ..modelling.adjustment import problem_of
 from ..modelling.calibration import with_estimates
 from ..network.camera import Camera
 from ..network.network import Network
-from .discrete import Single
+from .discrete import Single, log_choice
 
 _WIDER = ("opencv_full", "fisheye", "double_sphere")
 """Models that describe most lenses."""
@@ -33,6 +33,26 @@ def alternatives(result: Result, known: float) -> Iterator[Single]:
         found = _adjusted(result, replace(network, cameras=cameras), form, known)
         if found is not None:
             yield found
+
+
+def divided(result: Result, among: Single, known: float) -> Single:
+    """The images of another camera, adjusted with one; as they were where that explains less.
+
+    Cameras that are fixed to each other are no other cameras in some of their exposures.
+    """
+    if result.network.rig is not None:
+        return among
+    network = with_estimates(result)
+    own, camera_of = int(network.camera_of[among.rows[0]]), network.camera_of.copy()
+    camera_of[among.rows] = len(network.cameras)
+    other = replace(network.cameras[own], id=f"{network.cameras[own].id} other")
+    cameras = (*network.cameras, other)
+    found = _adjusted(result, replace(network, cameras=cameras, camera_of=camera_of), among.form, known)
+    if found is None:
+        return among
+    count = int((network.camera_of == own).sum())
+    log = found.log_evidence - log_choice(count, len(among.rows))
+    return replace(among, log_evidence=log, explained=found.explained) if log > among.log_evidence else among
 
 
 def _lenses(network: Network) -> Iterator[tuple[str, tuple[Camera, ...]]]:

@@ -44,7 +44,7 @@ class Single:
     rows: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
 
-def _log_choice(n: int, k: int) -> float:
+def log_choice(n: int, k: int) -> float:
     """Logarithm of the number of choices of k of n, for each of n numbers."""
     return float(
         scipy.special.gammaln(n + 1) - scipy.special.gammaln(k + 1) - scipy.special.gammaln(n - k + 1)
@@ -77,7 +77,7 @@ def gross_errors(sight: Sight, known: float) -> Single | None:
         left = left.with_effects(np.array([2 * at, 2 * at + 1]), far)
         columns = (2 * np.array(chosen)[:, None] + np.arange(2)).ravel()
         part = every.part(columns)
-        found = part.log_evidence(known=known) - _log_choice(n, len(chosen))
+        found = part.log_evidence(known=known) - log_choice(n, len(chosen))
         if best is None or found > best.log_evidence:
             less = every.square - left.square
             best = Single("blunders", f"{len(chosen)}", found, less, suspects[chosen])
@@ -119,7 +119,7 @@ def other_cameras(sight: Sight, part: Scores, known: float) -> Single | None:
             forms = [split.part(columns) for columns in (np.arange(1), np.arange(1, 3), np.arange(3))]
             each = [one.log_evidence(_INFORMATION, known=known) for one in forms]
             best = forms[int(np.argmax(each))]
-            log = float(scipy.special.logsumexp(each)) - np.log(3.0) - _log_choice(count, len(rows))
+            log = float(scipy.special.logsumexp(each)) - np.log(3.0) - log_choice(count, len(rows))
             explained = best.explained(best.best_size(_INFORMATION))
             found[key] = Single("other-camera", f"{len(rows)}", log, explained, np.flatnonzero(member))
         return found[key]

@@ -12,8 +12,9 @@ from ...core.data import Array, Mask, Rows
 from ...optics.mapping import PlaneMapping
 from ..diagnostics.evidence import Effect, in_camera, places_seen, sigma_seen, used_rows
 from ..diagnostics.fields import camera_mapping
-from ..diagnostics.image_effects import smooth_effects
+from ..diagnostics.image_effects import creases, smooth_effects
 from ..diagnostics.result import Result
+from .sentences import EACH
 
 _RADIAL = (3, 5, 7, 9)
 """Powers of the radius in the effects of a lens."""
@@ -294,9 +295,7 @@ def _target(sight: Sight) -> Iterator[Family]:
     seen = np.unique(sight.point)
     if not held[seen].all() or len(seen) < 6:
         return
-    xyz = values.xyz[seen]
-    middle = xyz.mean(axis=0)
-    _, size, axes = np.linalg.svd(xyz - middle, full_matrices=False)
+    middle, size, axes = _plane(values.xyz[seen])
     points = Effect(sight.by_point, np.searchsorted(seen, sight.point), len(seen))
     yield Family("target-shape", points, {"points": np.arange(3)}, None, "points", np.zeros(3, dtype=int))
     if size[2] > _PLANE * size[1]:
@@ -318,6 +317,29 @@ def _target(sight: Sight) -> Iterator[Family]:
     if all(step.any() for step in steps):
         spaced = np.outer(steps[0], across[0]) + np.outer(steps[1], across[1])
         yield _moved(sight, "target-scale", spaced[:, :, None], {"spacing of tags": np.arange(1)})
+
+
+def creased(sight: Sight) -> Iterator[Family]:
+    """Yield what differs over a plane target in each image: its heights, or anything smooth."""
+    xyz = sight.result.fit.values.xyz
+    seen = np.unique(sight.point)
+    if not sight.simple or len(seen) < 6:
+        return
+    middle, size, axes = _plane(xyz[seen])
+    if size[2] > _PLANE * size[1]:
+        return
+    flat = (xyz[sight.point] - middle) @ axes[:2].T
+    heights, any_way = sight.by_point @ axes[2:].T, np.tile(np.eye(2), (len(flat), 1, 1))
+    for code, slope in (("target-shape", heights), ("unknown", any_way)):
+        effect, roots = creases(sight.result.fit, flat, slope)
+        yield Family(code, effect, {f"{EACH}, {name}": root for name, root in roots.items()})
+
+
+def _plane(xyz: Array) -> tuple[Array, Array, Array]:
+    """Centre of points, their extents along axes, the largest first, and these (3, 3)."""
+    middle = xyz.mean(axis=0)
+    _, size, axes = np.linalg.svd(xyz - middle, full_matrices=False)
+    return middle, size, axes
 
 
 def _moved(sight: Sight, code: str, moves: Array, forms: Mapping[str, Rows]) -> Family:

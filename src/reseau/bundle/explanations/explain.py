@@ -9,7 +9,7 @@ best is taken into account, and what is left is looked at again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,9 +23,9 @@ from ...core.threads import one_thread
 from ..diagnostics.evidence import Scores, scores, too_large, used_rows
 from ..diagnostics.fields import camera_mapping
 from ..diagnostics.result import Result
-from .alternatives import alternatives
+from .alternatives import alternatives, divided
 from .discrete import Single, gross_errors, other_cameras
-from .effects import Family, Sight, families, lens_at
+from .effects import Family, Sight, creased, families, lens_at
 from .names import Misnamed
 from .sentences import advice, listed_places
 
@@ -309,13 +309,28 @@ def _compared(
         others = [gross_errors(sight, _KNOWN)]
         others += [] if near[1] is None else [other_cameras(near[0], near[1], _KNOWN)]
         single = {one.code: one for one in others if one is not None}
+        if (camera := single.get("other-camera")) and camera.log_evidence - sound > -np.log(_FALSE):
+            single["other-camera"] = divided(sight.result, camera, _KNOWN)
         found |= {code: one.log_evidence - sound for code, one in single.items()}
     if discrete and max(found.values()) > -np.log(_FALSE) and max(found, key=found.__getitem__) != "noise":
-        for one in alternatives(sight.result, _KNOWN):
+        # Where the model was chosen, the richer ones have been compared.
+        richer = alternatives(sight.result, _KNOWN) if sight.result.rivals is None else ()
+        for one in (*richer, *_of_creases(sight)):
             if one.log_evidence - sound > found.get(one.code, -np.inf):
                 found[one.code] = one.log_evidence - sound
                 single[one.code] = one
     return _Comparison(found, forms, single)
+
+
+def _of_creases(sight: Sight) -> Iterator[Single]:
+    """Yield what differs over the target from image to image, which has many effects."""
+    for family in creased(sight):
+        if too_large(sight.result.fit, family.effect.count):
+            continue
+        forms = _forms(family, scores(sight.result.fit, [family.effect]), sight)
+        log = float(scipy.special.logsumexp([form.log_evidence for form in forms])) - np.log(len(forms))
+        best = max(forms, key=lambda form: form.log_evidence)
+        yield Single(best.code, best.name, log, best.scores.explained(best.size))
 
 
 def _nearer(forms: list[_Form], sight: Sight, whole: Scores) -> list[_Form]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+EACH = "in each photograph"
+"""How forms begin that are another in each photograph."""
 _SENTENCES = {
     "lens": (
         "the camera model does not describe the lens",
@@ -29,6 +31,10 @@ _SENTENCES = {
         "the target is not as flat, or not as regular, as it is held",
         "calibrate with --target free or auto, or fix the target to something flat",
     ),
+    f"target-shape: {EACH}": (
+        "the target bends, otherwise in each photograph",
+        "fix it to something flat and take the photographs anew; the uncertainties contain it",
+    ),
     "target-scale": (
         "the target was not printed with the proportions of its design",
         "measure both axes of the print and correct the design, or calibrate with --target free",
@@ -46,7 +52,7 @@ _SENTENCES = {
 }
 
 
-def described(code: str) -> str:
+def described(code: str, form: str = "") -> str:
     """What a cause is.
 
     Examples
@@ -54,7 +60,12 @@ def described(code: str) -> str:
     >>> described("lens")
     'the camera model does not describe the lens'
     """
-    return _SENTENCES[code][0]
+    return _sentences(code, form)[0]
+
+
+def _sentences(code: str, form: str) -> tuple[str, str]:
+    """What a cause of a form is, and what to do."""
+    return _SENTENCES.get(f"{code}: {form.partition(',')[0]}", _SENTENCES[code])
 
 
 def advice(code: str, form: str, chosen: bool = False) -> str:
@@ -69,7 +80,7 @@ def advice(code: str, form: str, chosen: bool = False) -> str:
         return "no model that was compared describes it better"
     if code == "lens" and form == "1 more":
         return "estimate the next coefficient too, or leave out --model"
-    return _SENTENCES[code][1]
+    return _sentences(code, form)[1]
 
 
 def listed_places(names: Sequence[str], what: str, most: int = 4) -> str:

@@ -20,7 +20,7 @@ import scipy
 
 from ...calibration import CameraMapping, calibration_difference
 from ...calibration.camera import projection_field
-from ...core.data import Rows
+from ...core.data import Array, Rows
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Code, Estimated, Failure
@@ -53,8 +53,8 @@ _LEVEL = 0.01
 _LEAST = 3
 # Images, and image points of each, beyond which a choice takes longer and becomes no better.
 _IMAGES, _POINTS = 60, 200
-# Logarithm of how much less probable what does not count is.
-_CERTAIN = 20.0
+# Probability of a model that does not count; draws of how often images are taken.
+_NOTHING, _DRAWS = 1e-9, 1000
 # Places along the longer side at which cameras are compared.
 _ACROSS = 13
 
@@ -564,7 +564,8 @@ class _Search:
         """Return the choice, with all candidates."""
         found, fit = self._predictions(), self.fit
         variance = found[self.pick].variance if self.pick in found else 1.0
-        density = {each: float(one.log_density(variance).sum()) for each, one in found.items()}
+        by_image = {each: one.log_density(variance) for each, one in found.items()}
+        density = {each: float(one.sum()) for each, one in by_image.items()}
         best = max(density.values(), default=0.0)
         compared = []
         # What was chosen comes first: it may predict worse than others, by no more than chance.
@@ -587,7 +588,7 @@ class _Search:
                 compared.append(self._compared(each, one, found[self.pick], 2 * (best - density[each])))
         chosen = next(each for each in compared if each.candidate == self.pick)
         if self.before is None:
-            rivals = self._rivals(found, density)
+            rivals = self._rivals(found, by_image)
         else:
             alone, known = self.before.choice(), {each.candidate for each in compared}
             compared += [each for each in alone.compared if each.candidate not in known]
@@ -595,20 +596,26 @@ class _Search:
         return ModelChoice(camera_of(fit, self.camera), tuple(compared), chosen, rivals)
 
     def _rivals(
-        self, found: Mapping[Candidate, Prediction], density: Mapping[Candidate, float]
+        self, found: Mapping[Candidate, Prediction], by_image: Mapping[Candidate, Array]
     ) -> tuple[Rival, ...]:
-        """The best candidate of each kind but that of the chosen one, with its probability."""
-        if self.pick not in density:
+        """The best candidate of each kind but that of the chosen one, with its probability.
+
+        The images are few: which kinds others would have preferred is the mean over how often each of these
+        could have been taken (Yao, Vehtari, Simpson & Gelman 2018, *Bayesian Anal.* 13: pseudo-BMA+).
+        """
+        if self.pick not in by_image:
             return ()
-        kinds = [self.pick]
-        for each in sorted(density, key=lambda each: -density[each]):
+        order, kinds = sorted(by_image, key=lambda each: -float(by_image[each].sum())), list[Candidate]()
+        for each in order:
             kinds += [each] if not any(each.alike(other) for other in kinds) else []
-        alike = max(value for each, value in density.items() if each.alike(self.pick))
-        total = float(scipy.special.logsumexp([alike, *(density[each] for each in kinds[1:])]))
+        each_image = np.stack([by_image[each] for each in kinds])
+        images = each_image.shape[1]
+        often = images * np.random.default_rng(0).dirichlet(np.ones(images), _DRAWS)
+        probability = scipy.special.softmax(often @ each_image.T, axis=1).mean(axis=0)
         return tuple(
-            Rival(float(np.exp(density[each] - total)), self._mapping(each, found[each]))
-            for each in kinds[1:]
-            if density[each] - total > -_CERTAIN
+            Rival(float(p), self._mapping(each, found[each]))
+            for each, p in zip(kinds, probability, strict=True)
+            if p > _NOTHING and not each.alike(self.pick)
         )
 
     def _compared(self, own: Candidate, one: Prediction, chosen: Prediction, length: float) -> Compared:

@@ -120,7 +120,8 @@ class Softness(NamedTuple):
 
 def student(value: Array, scale: Array | float) -> Array:
     """Density of Student's distribution with four degrees of freedom."""
-    return np.asarray(0.375 * (1 + (value / scale) ** 2 / 4) ** -2.5 / scale)
+    square = 1 + np.square(value / (2 * scale))
+    return np.asarray(0.375 / (square * square * np.sqrt(square) * scale))
 
 
 def softness_of(widths: Sequence[tuple[float, float] | None], side: float) -> list[Softness]:
@@ -150,8 +151,12 @@ def softness_of(widths: Sequence[tuple[float, float] | None], side: float) -> li
     before, beside = before / (1 + before), 1 - np.exp(-_CONTOURS * hidden / 2)
     alike = (1 - before) * (1 - _SHARPENED) * student(away, scale)
     increase, displaced, share = _ALL
-    each = share * student(away[..., None] - increase, scale[:, None])
-    lined = before * each.sum(axis=-1)
+    sums, flat = np.stack([share, share * displaced**2], axis=1), away.reshape(-1, len(seen))
+    each = np.concatenate([  # in blocks that fit into the cache
+        student(rows[..., None] - increase, scale[:, None]) @ sums
+        for rows in np.array_split(flat, len(flat) // 16 + 1)
+    ]).reshape(*away.shape, 2)  # fmt: skip
+    lined = before * each[..., 0]
     sharp = (
         _SHARPENED / _RANGE * ((away < 0) & (away > -_RANGE)) * (1 - 2 * scale**2 / (away**2 + 2 * scale**2))
     )
@@ -159,7 +164,7 @@ def softness_of(widths: Sequence[tuple[float, float] | None], side: float) -> li
     total = np.log(every).sum(axis=2) + np.log(student(apart, _DIRECTIONS))
     weight = np.exp(total - total.max())
     weight /= weight.sum()
-    moved = (each * displaced**2).sum(axis=-1) / each.sum(axis=-1) * np.exp(2 * common)[:, None, None]
+    moved = each[..., 1] / each[..., 0] * np.exp(2 * common)[:, None, None]
     found = [Softness(0.0)] * len(widths)
     for i, k in enumerate(seen):
         p, q = (float((weight * part[..., i] / every[..., i]).sum()) for part in (lined, sharp))

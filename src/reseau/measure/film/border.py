@@ -291,10 +291,10 @@ def binned(grey: Array, distance: Array, low: float, size: float, count: int) ->
 
 
 def row_median(values: Array) -> Array:
-    """Medians of rows without NaN; NaN for an empty row."""
-    empty: Mask = np.asarray(~np.isfinite(values).any(axis=1))
-    filled = np.where(empty[:, None], 0.0, values)
-    return np.asarray(np.where(empty, np.nan, np.nanmedian(filled, axis=1)))
+    """Medians of rows without NaN; NaN for an empty row. Quicker than those of NumPy, by masks."""
+    count, rows = np.isfinite(values).sum(axis=1), np.arange(len(values))
+    ordered = np.sort(values, axis=1)
+    return np.asarray((ordered[rows, (count - 1) // 2] + ordered[rows, count // 2]) / 2)
 
 
 def _running(values: Array) -> Array:

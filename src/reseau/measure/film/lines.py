@@ -18,7 +18,7 @@ from ...adjust.outliers import robust
 from ...core.data import Array, Mask
 from ...core.failure import Code, Failure
 from ...io import EDGES
-from .search import crossings_of
+from .search import frame_axes, moved
 
 _BOW_PX, _LEAST_BOW_PX = 3.0, 0.2
 """Prior standard deviation of the bow of an edge in pixels, and its minimum once bows are measured."""
@@ -286,7 +286,7 @@ def explained_shape(
     seen = gate + np.pad(converging, (0, 1)) + np.diag([0.0, 0.0, 0.0, 8 * shape.aspect_sigma**2])
     off = off - np.array(shape.deviation)
     tilted = _TILTED * float(np.exp(min(density(off, seen) - density(off, gate), 600.0)))
-    a, b, normal = _frame_axes(corners)
+    a, b, normal = frame_axes(corners)
     length = np.hypot(*(b - a).T)
     odds, found = [], []
     for k, own in enumerate(edges):
@@ -334,24 +334,15 @@ def _bow_of(bow: Array, sigma: Array) -> float:
     return float(np.clip(1.5 * np.sqrt(max(variance, 0.0)), _LEAST_BOW_PX, _BOW_PX))
 
 
-def _frame_axes(corners: Array) -> tuple[Array, Array, Array]:
-    """Start and end of the approximate edges and their inward normals, each (4, 2)."""
-    following = np.roll(corners, -1, axis=0)
-    along = (following - corners) / np.hypot(*(following - corners).T)[:, None]
-    return corners, following, np.stack([-along[:, 1], along[:, 0]], axis=1)
-
-
 def _corners(values: Array, corners: Array) -> Array:
     """Corners of the adjusted chords."""
-    a, b, normal = _frame_axes(corners)
-    ends = values[:12].reshape(4, 3)
-    return crossings_of(a + ends[:, :1] * normal, b + ends[:, 1:2] * normal)
+    return moved(corners, values[:12].reshape(4, 3)[:, :2])
 
 
 def shape_of(corners: Array, shape: FrameShape) -> Array:
     """Shape of corners (4, 2): three angles minus right angles, log of proportions over the format's."""
-    side = np.roll(corners, -1, axis=0) - corners
-    before = np.roll(side, 1, axis=0)
+    side = corners[[1, 2, 3, 0]] - corners
+    before = side[[3, 0, 1, 2]]
     turn = np.arctan2(before[:, 0] * side[:, 1] - before[:, 1] * side[:, 0], (before * side).sum(axis=1))
     length = np.hypot(*side.T)
     aspect = np.log((length[0] + length[2]) / (length[1] + length[3]) * shape.height / shape.width)
@@ -407,7 +398,7 @@ def _lines(
         axis=1,
     )
     used, rms, coverage = (np.zeros(4) for _ in range(3))
-    a, b, _ = _frame_axes(corners)
+    a, b, _ = frame_axes(corners)
     for k, edge in enumerate(edges):
         rms[k] = np.nan
         if edge is not None:

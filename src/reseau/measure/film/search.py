@@ -20,7 +20,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ...core.data import Array
-from .border import best_line, likelihood
+from .border import best_line, likelihood, row_median
 
 Plane = NDArray[np.float32]
 
@@ -68,7 +68,7 @@ def _judged(guess: FrameGuess, grey: Plane) -> FrameGuess | None:
     level, spread, strong = _film(guess, outside[seen], inside[seen])
     if strong <= 0:
         return None
-    own = np.nanmedian(np.where(known, outside, level), axis=1)
+    own = np.median(np.where(known, outside, level), axis=1)
     contrast = guess.polarity * (inside - own[:, None])
     least = max(4 * spread, 0.08 * strong)
     film = np.abs(outside - own[:, None]) < max(least, 0.15 * strong)
@@ -89,10 +89,10 @@ def _within(corners: Array, shape: tuple[int, ...]) -> bool:
 
 def _film(guess: FrameGuess, outside: Array, inside: Array) -> tuple[float, float, float]:
     """Tone of unexposed film, its scatter, and the contrast of a bright picture against it."""
-    own = np.nanmedian(outside, axis=1)
+    own = row_median(outside)
     # Film is darker than any picture (polarity 1); the second darkest of the edges is robust.
     level = float(guess.polarity * np.sort(guess.polarity * own)[min(1, len(own) - 1)])
-    spread = float(np.nanmedian(np.abs(outside - own[:, None])))
+    spread = float(row_median(np.abs(outside - own[:, None]).reshape(1, -1))[0])
     strong = float(np.nanquantile(guess.polarity * (inside - level), 0.8))
     return level, spread, strong
 
@@ -108,7 +108,7 @@ def _settled(guess: FrameGuess, grey: Plane) -> FrameGuess:
     profiles = np.stack([_beside(guess.corners, grey, (float(o),)) for o in offsets], axis=2)
     known = np.isfinite(profiles)
     least = max(4 * spread, 0.08 * strong)
-    moved = np.zeros((4, 2))
+    ends = np.zeros((4, 2))
     for k in np.flatnonzero(seen):
         near = _running(outside[k], level)
         # Nothing is known beyond the border of the scan, where film may be brighter than at other edges.
@@ -125,9 +125,9 @@ def _settled(guess: FrameGuess, grey: Plane) -> FrameGuess:
         departure = guess.polarity * (np.where(known[k], profiles[k], film) - film) / significant
         found = likelihood(departure, known[k], out + 2, gap)
         start, stop = best_line(found, _ALONG, 2, len(offsets) - 2 * reach, 4)
-        moved[k] = offsets[0] - 0.5 + np.array([start, stop])
+        ends[k] = offsets[0] - 0.5 + np.array([start, stop])
     return FrameGuess(
-        _moved(guess.corners, moved), guess.polarity, guess.format_mm, guess.supported, guess.score
+        moved(guess.corners, ends), guess.polarity, guess.format_mm, guess.supported, guess.score
     )
 
 
@@ -137,20 +137,20 @@ def _running(values: Array, level: float) -> Array:
     return np.asarray(scipy.ndimage.median_filter(filled, size=31, mode="nearest"))
 
 
-def _moved(corners: Array, ends: Array) -> Array:
-    """Corners of a frame whose edges are moved inwards by `ends` (4, 2) at their start and end."""
-    following = np.roll(corners, -1, axis=0)
+def frame_axes(corners: Array) -> tuple[Array, Array, Array]:
+    """Start and end of the edges of a frame and their inward normals, each (4, 2)."""
+    following = corners[[1, 2, 3, 0]]
     along = (following - corners) / np.hypot(*(following - corners).T)[:, None]
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    a, b = corners + ends[:, :1] * normal, following + ends[:, 1:] * normal
-    return crossings_of(a, b)
+    return corners, following, np.stack([-along[:, 1], along[:, 0]], axis=1)
 
 
-def crossings_of(a: Array, b: Array) -> Array:
-    """Corners (4, 2) of lines through a and b, both (4, 2); corner k is where line k meets line k − 1."""
-    line = np.cross(np.column_stack([a, np.ones(4)]), np.column_stack([b, np.ones(4)]))
-    corner = np.cross(np.roll(line, 1, axis=0), line)
-    return np.asarray(corner[:, :2] / corner[:, 2:])
+def moved(corners: Array, ends: Array) -> Array:
+    """Corners of a frame whose edges are moved inwards by `ends` (4, 2) at their start and end."""
+    a, b, normal = frame_axes(corners)
+    (ax, ay), (bx, by) = (a + ends[:, :1] * normal).T, (b + ends[:, 1:] * normal).T
+    x, y, z = line = np.stack([ay - by, bx - ax, ax * by - ay * bx])
+    u, v, w = line[:, [3, 0, 1, 2]]
+    return np.asarray(np.stack([v * z - w * y, w * x - u * z], axis=1) / (u * y - v * x)[:, None])
 
 
 def _sides(guess: FrameGuess, grey: Plane) -> tuple[Array, Array]:
@@ -162,9 +162,7 @@ def _sides(guess: FrameGuess, grey: Plane) -> tuple[Array, Array]:
 def _beside(corners: Array, grey: Plane, offsets: Sequence[float]) -> Array:
     """Mean grey values (4, 80) along the edges at given distances inwards; NaN outside the overview."""
     t = (_ALONG + 1) / 2
-    a, b = corners, np.roll(corners, -1, axis=0)
-    along = (b - a) / np.hypot(*(b - a).T)[:, None]
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    a, b, normal = frame_axes(corners)
     at = a[:, None] + t[:, None] * (b - a)[:, None]
     total = np.zeros(at.shape[:2])
     for offset in offsets:
