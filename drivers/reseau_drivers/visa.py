@@ -219,12 +219,12 @@ class VisaLink:
             raise ConnectionLost(f"{self._name}: {error.description}", do="is it switched on?") from None
         except InstrumentError:
             raise
-        except ValueError:  # the back end waits on a connection that it has closed
-            what = f"{what} failed, its connection has ended"
-            raise ConnectionLost(f"{self._name}: {what}", do="is it switched on?") from None
         except Exception as error:
-            # The back end raises OSError, RuntimeError, RPCError, USBError and bare Exception.
-            raise ConnectionLost(f"{self._name}: {what} failed ({error})", do="is it switched on?") from None
+            # The back end raises OSError, RuntimeError, RPCError, USBError and bare Exception, and ValueError
+            # where it waits on a connection that it has closed.
+            ended = isinstance(error, ValueError) and what != "open"
+            why = ", its connection has ended" if ended else f" ({error})"
+            raise ConnectionLost(f"{self._name}: {what} failed{why}", do="is it switched on?") from None
 
 
 def scpi_link(address: str | Link) -> Link:
