@@ -156,7 +156,7 @@ def test_axes_without_a_reference_are_noticed_before_the_session_begins(
     given = ["capture", "testfield", "-d", "field.json", "--poses", "poses.csv", "--pitch-mm", "0.027",
              "--free", "c", "--checks", "0", "--name", "monday"]  # fmt: skip
     assert run(given) == 1
-    assert "table: tilt has no reference; give --home" in capsys.readouterr().err
+    assert "table: tilt has no reference; home them first" in capsys.readouterr().err
     assert run(["archive", "list"]) == 0
     assert "monday" not in capsys.readouterr().out
     assert run([*given, "--home"]) == 0

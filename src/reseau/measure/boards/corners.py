@@ -32,7 +32,7 @@ from ..reseau.plane_marks import PlaneMarks, intact
 from ..response import sharpened_from_px
 from ..screening import Screened
 from .candidates import ended
-from .shadows import pixels_alike, shaded
+from .shadows import Shaded, pixels_alike, shaded
 
 _TURN = 0.1
 """Standard deviation of the directions of edges before the mapping is known, radians."""
@@ -356,8 +356,9 @@ class CornerMarks(PlaneMarks):
         start = self.start[rows] = np.where(plain[:, None], found.xy, self.mapping(self.at[rows]))
         images, reach = self._images(rows)
         high, wide = (n // 2 for n in found.residuals.shape[1:])
-        beside = self.beside()
-        for part, half in self._windows(reach):
+        beside, psf = self.beside(), (self.look.psf_px, self.look.psf_log_sigma)
+
+        def looked_at(part: Rows, half: tuple[int, int]) -> Shaded:
             half = min(half[0], wide), min(half[1], high)
             x, y = self.pixels(rows[part], half)
             window, region = self.window(rows[part], half), self._region(rows[part], half)
@@ -367,24 +368,24 @@ class CornerMarks(PlaneMarks):
             used &= True if region is None else region
             if beside is not None:
                 used &= np.abs(beside[y, x]) < BESIDE
-            grey, psf = (
-                self.screened.grey[y, x].astype(np.float64),
-                (self.look.psf_px, self.look.psf_log_sigma),
-            )
-            own = shaded(
-                grey,
-                used,
-                self._shape(images, part),
-                window,
-                start[part],
-                ink,
-                psf,
-                self._form_sigma(),
-                noise,
-                alike,
-            )
-            found = own.instead_of(found, part)
-            self.crossed[rows[part]] = ~own.converged
+            return shaded(
+                self.screened.grey[y, x].astype(np.float64), used, self._shape(images, part), window,
+                start[part], ink, psf, self._form_sigma(), noise, alike,
+            )  # fmt: skip
+
+        # Where no corner that is objected to lies in a shadow, none does.
+        suspected = objected & (found.rejected > 0)
+        for chosen in (suspected, ~suspected):
+            some = False
+            for part, half in self._windows(reach):
+                part = part[chosen[part]]
+                if len(part):
+                    own = looked_at(part, half)
+                    found = own.instead_of(found, part)
+                    self.crossed[rows[part]] = ~own.converged
+                    some |= bool((own.edges > 0).any() or not own.converged.all())
+            if not some:
+                break
         return found
 
     def _width(self, at: Array) -> Array:
