@@ -70,7 +70,8 @@ def world(
 def calibrated(
     measured: Mapping[str, ImagePoints], target: str = "flat", model: CameraOptions | None = OPENCV
 ) -> Calibrated:
-    options = CalibrationOptions(target=target)  # type: ignore[arg-type]
+    # Gross errors are looked at, not left out.
+    options = CalibrationOptions(target=target, reject=False)  # type: ignore[arg-type]
     return calibrate_camera(measured.items(), DESIGN, lambda _: None, SIZE, model, options).required()  # type: ignore[arg-type, return-value]
 
 

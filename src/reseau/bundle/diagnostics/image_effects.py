@@ -13,11 +13,11 @@ from ..solver.system import residuals
 from .evidence import Effect, places_seen, used_rows
 
 _LENGTHS = (0.3, 0.6, 1.2)
-"""Distances, in half the diagonal of the image, over which displacements of an image are alike."""
+"""Distances, in half the diagonal of the image or target, over which displacements of an image are alike."""
 _DEGREE, _NODES = 4, 12
 """Degree of the polynomials that describe a smooth field, and nodes of the integration over the image."""
-_CREASES, _OF_CREASES = (0.15, 0.3, 0.6), 6
-"""Distances, in half the diagonal of a target, over which heights are alike; degree of their polynomials."""
+_OF_CREASES = 6
+"""Degree of the polynomials that describe smooth displacements over a target."""
 
 
 def smooth_effects(fit: BundleFit, degree: int = _DEGREE) -> tuple[Effect, dict[str, Array]]:
@@ -57,7 +57,7 @@ def creases(fit: BundleFit, flat: Array, slope: Array) -> tuple[Effect, dict[str
     over = _polynomials(2 * (flat - low) / (high - low) - 1, powers)
     kinds, half, images = slope.shape[2], (high - low) / np.hypot(*(high - low)), len(network.images)
     columns = (slope[:, :, :, None] * over[:, None, None, :]).reshape(len(flat), 2, -1)
-    roots = {f"{length:g}": np.kron(np.eye(kinds), _root(half, length, powers)) for length in _CREASES}
+    roots = {f"{length:g}": np.kron(np.eye(kinds), _root(half, length, powers)) for length in _LENGTHS}
     forms = {name: np.tile(root, (images, 1, 1)) for name, root in roots.items()}
     return Effect(columns, network.image_of[used_rows(fit)], images), forms
 
