@@ -187,7 +187,8 @@ class Calibrated(Estimated, Display):
     def described(self, **changes: Any) -> Calibrated:
         """The same result with other notes, names or files; what is wrong with it is not looked for again."""
         found = replace(self, **changes)
-        found.__dict__.update({k: each for k, each in self.__dict__.items() if k == "explanation"})
+        if "explanation" in self.__dict__:
+            found.__dict__["explanation"] = self.explanation
         return found
 
     @cached_property

@@ -178,9 +178,8 @@ class Scores:
         possible = quad > 0
         quad = quad[possible]
         free = scipy.special.gammaln(half) + half * np.log(2.0) - half * np.log(quad) - np.log(_LOG_RANGE)
-        share = known
         with np.errstate(divide="ignore"):
-            found[possible] = np.logaddexp(-0.5 * quad + np.log(share), free + np.log1p(-share))
+            found[possible] = np.logaddexp(-0.5 * quad + np.log(known), free + np.log1p(-known))
         return found
 
     def log_profile(self, sizes: Array) -> Array:

@@ -295,10 +295,10 @@ def _target(sight: Sight) -> Iterator[Family]:
     seen = np.unique(sight.point)
     if not held[seen].all() or len(seen) < 6:
         return
-    middle, size, axes = _plane(values.xyz[seen])
+    middle, axes, plane = _axes(values.xyz[seen])
     points = Effect(sight.by_point, np.searchsorted(seen, sight.point), len(seen))
     yield Family("target-shape", points, {"points": np.arange(3)}, None, "points", np.zeros(3, dtype=int))
-    if size[2] > _PLANE * size[1]:
+    if not plane:
         return
     # The axes of the design: prints are stretched along them.
     across = np.eye(3)[:2] if abs(axes[2, 2]) > 0.9 else axes[:2]
@@ -325,8 +325,8 @@ def creased(sight: Sight) -> Iterator[Family]:
     seen = np.unique(sight.point)
     if not sight.simple or len(seen) < 6:
         return
-    middle, size, axes = _plane(xyz[seen])
-    if size[2] > _PLANE * size[1]:
+    middle, axes, plane = _axes(xyz[seen])
+    if not plane:
         return
     flat = (xyz[sight.point] - middle) @ axes[:2].T
     heights, any_way = sight.by_point @ axes[2:].T, np.tile(np.eye(2), (len(flat), 1, 1))
@@ -335,11 +335,11 @@ def creased(sight: Sight) -> Iterator[Family]:
         yield Family(code, effect, {f"{EACH}, {name}": root for name, root in roots.items()})
 
 
-def _plane(xyz: Array) -> tuple[Array, Array, Array]:
-    """Centre of points, their extents along axes, the largest first, and these (3, 3)."""
+def _axes(xyz: Array) -> tuple[Array, Array, bool]:
+    """Centre of points, their principal axes (3, 3), the longest first, and whether they are plane."""
     middle = xyz.mean(axis=0)
     _, size, axes = np.linalg.svd(xyz - middle, full_matrices=False)
-    return middle, size, axes
+    return middle, axes, bool(size[2] <= _PLANE * size[1])
 
 
 def _moved(sight: Sight, code: str, moves: Array, forms: Mapping[str, Rows]) -> Family:

@@ -82,9 +82,9 @@ def form_of(
     return _fields(schema, schema, dict(values or {}), prefix, True, but)
 
 
-def _described(text: str) -> dict[str, str]:
+def _described(about: str) -> dict[str, str]:
     """The first sentence about each parameter of a class, by the description that its schema has."""
-    found = _PARAMETERS.search(text)
+    found = _PARAMETERS.search(about)
     said = dict[str, str]()
     for names, text in _ENTRY.findall("" if found is None else found[1] + "\n"):
         sentence = " ".join(text.split()).replace("`", "")
