@@ -65,6 +65,7 @@ def test_models_of_other_kinds_are_read_as_they_were_written_and_refused_if_they
     broken: list[object] = [
         7, [3], [{**entry, "probability": 1.2}], [{**entry, "covariance": [[1.0]]}],
         [{**entry, "model": {**model, "model": "none"}}], [{**entry, "estimated": ["k9"]}],
+        [{**entry, "model": {**model, "width": 320}}],
     ]  # fmt: skip
     for rivals in broken:
         with pytest.raises(FormatError, match="damaged or unknown model"):

@@ -163,6 +163,8 @@ class CameraMapping(CalibratedMapping):
             others = tuple(Rival.from_entry(each) for each in rivals)
             if not 0 <= sum(each.probability for each in others) <= 1 + 1e-9:
                 raise ValueError("probabilities of models are none")
+            if any(each.lens.size != (model["width"], model["height"]) for each in others):
+                raise ValueError("models are of images of different sizes")
         except (UsageError, KeyError, IndexError, TypeError, ValueError) as error:
             raise FormatError(f"has a damaged or unknown model: {error}", where=where) from None
         unknown = [name for name in values if name not in mapping.names]
