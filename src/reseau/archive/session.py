@@ -23,6 +23,8 @@ from .records import ArchivedFrame, ArchivedResult, Verdict, utc, utc_now
 
 INPUT = "input"
 """Kind of the input files of a session."""
+_GIVEN = schema.verdicts.alias()
+"""The verdicts once more; made for each query they would be garbage that only a search for cycles finds."""
 
 
 class _Stored(NamedTuple):
@@ -248,7 +250,7 @@ class Session:
 
     def _judged(self, query: Any, *where: sa.ColumnElement[bool]) -> Any:
         """Make a query one of pictures of this session, each with its last verdict."""
-        f, v, given = schema.frames.c, schema.verdicts.c, schema.verdicts.alias().c
+        f, v, given = schema.frames.c, schema.verdicts.c, _GIVEN.c
         latest = sa.select(sa.func.max(given.id)).where(given.frame_id == f.id).scalar_subquery()
         joined: Any = query.select_from(schema.frames).outerjoin(schema.verdicts, v.id == latest)
         return joined.where(f.session_id == self._id, *where)
