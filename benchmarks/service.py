@@ -8,10 +8,13 @@
 `load` starts `reseau serve` with a bench whose camera has a clock of its own: a frame each half second, and
 whoever asks too late misses one. A session takes them all, while 200 clients read server-sent events and
 requests arrive at a constant rate, whether earlier ones are answered or not. A frame is lost if its number is
-missing in the archive, and late if it is stored after the next one is due. The time of a request counts from
-the moment at which it was due. Clients check that no event is missing or repeated. The memory of service
-and worker (what is resident, without pages of files) is flat if the straight line through the second half of
-the run rises by less than 1 MB. With `--frames` the session has so many frames already, as after hours.
+missing in the archive, and late if it is stored after the next one is due. The camera counts what it dropped,
+as transports do, and how long its process waited for a processor or the disk before: a frame that would have
+been asked for in time without these waits is lost for want of the machine, and counted apart; any other one,
+or one that the camera did not drop, is a fault. The time of a request counts from the moment at which it was
+due. Clients check that no event is missing or repeated. The memory of service and worker (what is resident,
+without pages of files) is flat if the straight line through the second half of the run rises by less than
+1 MB. With `--frames` the session has so many frames already, as after hours.
 
 `sessions` fills an archive as after years: sessions with frames and results, configurations with decisions,
 an audit log. It takes the time and the processor time of pages and operations: at first at most 1 s each,
@@ -220,6 +223,7 @@ def load(minutes: float, clients: int, rate: float, already: int) -> int:
             filled(folder, already)
             time.sleep(5.0)
             first = frames_of(folder, 0)[2]
+            (folder / clocked.MISSED).unlink(missing_ok=True)
             before = {each: sum(each.cpu_times()[:2]) for each in (service, worker)}
             made = Load(port, token)
             memory = asyncio.run(
@@ -229,7 +233,7 @@ def load(minutes: float, clients: int, rate: float, already: int) -> int:
             http.post("/benches/cellar/abort").raise_for_status()
             while http.get("/benches/cellar").json()["state"] != "ready":
                 time.sleep(0.1)
-        lost, late, frames, delays = frames_of(folder, first)
+        (lost, late, frames, delays), wanting = frames_of(folder, first), machine_of(folder)
     every = sorted(each for times in made.seconds.values() for each in times)
     p50, p99 = (1e3 * every[int(q * (len(every) - 1))] for q in (0.5, 0.99))
     print(f"{minutes:g} min, {clients} clients of events, {rate:g} requests/s, {os.cpu_count()} cores")
@@ -240,7 +244,9 @@ def load(minutes: float, clients: int, rate: float, already: int) -> int:
         print(f"  {path:38} median {1e3 * statistics.median(times):6.1f} ms, "
               f"p99 {1e3 * times[int(0.99 * (len(times) - 1))]:6.1f} ms")  # fmt: skip
     print(f"events        {made.received} received, {made.missing} missing, {made.repeated} repeated")
-    print(f"frames        {frames}: {lost} lost, {late} late; stored after "
+    faults = sum(number not in wanting for number in lost + late)
+    print(f"frames        {frames}: {len(lost)} lost, {len(late)} late, of these {faults} by a fault and the "
+          f"others for want of processor or disk; stored after "
           f"{1e3 * statistics.median(delays):.0f} ms (median), "
           f"{1e3 * max(delays):.0f} ms (longest)")  # fmt: skip
     print(f"processor     service {1e3 * spent[0] / len(every):.1f} ms per request with events, "
@@ -254,7 +260,7 @@ def load(minutes: float, clients: int, rate: float, already: int) -> int:
               f"{grown:+.2f} ± {sigma:.2f} MB in the last {seconds / 60:.0f} min")  # fmt: skip
     kept = (
         p99 < 200
-        and not (made.failed or lost or late or made.missing or made.repeated)
+        and not (made.failed or faults or made.missing or made.repeated)
         and set(made.statuses) == {200}
     )
     print("kept" if kept and flat else "NOT KEPT")
@@ -294,8 +300,8 @@ def filled(folder: Path, count: int) -> None:
                 connection.execute(sa.insert(schema.verdicts), verdicts)
 
 
-def frames_of(folder: Path, after: int) -> tuple[int, int, int, list[float]]:
-    """Frames after the first ones: how many are lost, late, there; and the times until they were stored."""
+def frames_of(folder: Path, after: int) -> tuple[list[int], list[int], int, list[float]]:
+    """Frames after the first ones: lost and late ones, how many are there, and the times until stored."""
     with Archive.open(folder / "archive") as archive:
         found = archive.session("load").frames(kind="frame")[after:]
         with archive._engine.connect() as connection:
@@ -306,8 +312,21 @@ def frames_of(folder: Path, after: int) -> tuple[int, int, int, list[float]]:
         taken = datetime.fromtimestamp(each.clock["sequence"][0] * clocked.PERIOD_S, UTC)
         at = stored[each.id]
         delays.append(((at if at.tzinfo else at.replace(tzinfo=UTC)) - taken).total_seconds())
-    lost = numbers[-1] - numbers[0] + 1 - len(set(numbers))
-    return lost, sum(each > clocked.PERIOD_S for each in delays), len(found), delays
+    lost = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers)) if numbers else []
+    late = [number for number, each in zip(numbers, delays, strict=True) if each > clocked.PERIOD_S]
+    return lost, late, len(found), delays
+
+
+def machine_of(folder: Path) -> set[int]:
+    """Numbers of frames that would have been in time, had the worker not waited for processor or disk."""
+    missed = folder / clocked.MISSED
+    rows = [json.loads(each) for each in missed.read_text().splitlines()] if missed.is_file() else []
+    found = set[int]()
+    for row in rows:
+        print(f"missed        {row}")
+        if row["gap"] - row["processor"] - row["disk"] < clocked.PERIOD_S:
+            found |= set(range(row["after"], row["after"] + 1 + int(row["gap"] / clocked.PERIOD_S)))
+    return found
 
 
 FRAMES, CONFIGURATIONS, DECISIONS, RECORDED = 20, 5, 52, 2000
