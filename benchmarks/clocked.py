@@ -1,7 +1,7 @@
 """A camera with a clock of its own, for `service.py`: whoever asks too late misses a frame.
 
 As the transports of real cameras do, it counts the frames that it dropped. It also notes for how long its
-process waited meanwhile, for a processor or the disk, by the counters of Linux.
+process waited for a processor meanwhile, by the counters of Linux.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from reseau.core.errors import ConnectionLost
 
 PERIOD_S = 0.5
 MISSED = "missed.jsonl"
-"""File with the last frame before each gap, the time until the next was asked for, and waits (s)."""
+"""File with the last frame before each gap, the time until the next was asked for, and that waited (s)."""
 _ENTRIES = "[reseau.instruments]\nclocked = benchmarks.clocked:ClockedCamera\n"
 
 
@@ -35,15 +35,15 @@ class ClockedCamera(Simple):
         draw = np.random.default_rng(1)
         self._pixels = draw.integers(40, 200, (480, 640), dtype=np.uint8)
         self._last = self._dropped = 0
-        self._since = time.time(), 0.0, 0.0
+        self._since = time.time(), 0.0
 
     def expose(self, seconds: float | None = None) -> Taken:
         """Wait for the next frame."""
         number = max(int(time.time() / PERIOD_S), self._last) + 1
         if self._last and number > self._last + 1:
             self._dropped += number - self._last - 1
-            gap, processor, disk = np.subtract((time.time(), *_waits()), self._since)
-            row = {"after": self._last, "gap": gap, "processor": processor, "disk": disk}
+            gap, processor = time.time() - self._since[0], _waited() - self._since[1]
+            row = {"after": self._last, "gap": gap, "processor": processor}
             with (Path(tempfile.gettempdir()) / MISSED).open("a") as file:
                 file.write(json.dumps(row) + "\n")
         while (left := number * PERIOD_S - time.time()) > 0:
@@ -52,7 +52,7 @@ class ClockedCamera(Simple):
         self._last = number
         pixels = np.roll(self._pixels, number, axis=1)
         at = datetime.fromtimestamp(number * PERIOD_S, UTC)
-        self._since = time.time(), *_waits()
+        self._since = time.time(), _waited()
         return Taken(Frame(pixels, 255.0), number, at, self.settings.exposure_us, dropped=self._dropped)
 
     def frames(self, count: int, seconds: float | None = None) -> Iterator[Taken]:
@@ -60,15 +60,13 @@ class ClockedCamera(Simple):
         return (self.expose(seconds) for _ in range(count))
 
 
-def _waits() -> tuple[float, float]:
-    """Time that threads of this process could run and did not, and that the disk was awaited (s)."""
-    processor = disk = 0.0
+def _waited() -> float:
+    """Time that threads of this process could run and did not (s)."""
+    found = 0.0
     for task in Path("/proc/self/task").glob("*/schedstat"):
         with suppress(OSError):  # a thread that has just ended
-            processor += float(task.read_text().split()[1]) / 1e9
-    with suppress(OSError):  # not counted by this kernel
-        disk = float(Path("/proc/pressure/io").read_text().partition("total=")[2].split()[0]) / 1e6
-    return processor, disk
+            found += float(task.read_text().split()[1]) / 1e9
+    return found
 
 
 def install(folder: Path) -> None:
