@@ -24,7 +24,8 @@ from .records import ArchivedFrame, ArchivedResult, Verdict, utc, utc_now
 INPUT = "input"
 """Kind of the input files of a session."""
 _GIVEN = schema.verdicts.alias()
-"""The verdicts once more; made for each query they would be garbage that only a search for cycles finds."""
+_GOOD_STEPS = sa.func.count(sa.distinct(sa.case((schema.verdicts.c.ok, schema.frames.c.step))))
+"""Parts of queries; made for each query they would be garbage that only a search for cycles finds."""
 
 
 class _Stored(NamedTuple):
@@ -302,9 +303,7 @@ class Session:
 
     def counts(self) -> tuple[int, int]:
         """Return the number of frames, and that of steps with a good one."""
-        f, v = schema.frames.c, schema.verdicts.c
-        good = sa.func.count(sa.distinct(sa.case((v.ok, f.step))))
-        query = self._judged(sa.select(sa.func.count(), good), f.kind == "frame")
+        query = self._judged(sa.select(sa.func.count(), _GOOD_STEPS), schema.frames.c.kind == "frame")
         with schema.connected(self._engine, reading=True) as connection:
             taken, steps = connection.execute(query).one()
         return taken, steps

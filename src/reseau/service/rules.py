@@ -314,8 +314,8 @@ def _since_reference(
         turn, most = said.turns()
         first, about, last, largest = ((now + timedelta(days=each)).date() for each in (*days, turn))
         texts = [
-            f"creeps by {7 * said.rate_day:.2g} {unit} a week, and reaches the limit of {limits.action:g} {unit} "
-            f"about {about} ({first} to {last})"
+            f"creeps by {7 * said.rate_day:.2g} {unit} a week, and reaches the limit of "
+            f"{limits.action:g} {unit} about {about} ({first} to {last})"
         ]
         if (share := said.seasonal / (said.creeping + said.seasonal)) > _MENTIONED:
             season = f"follows the seasons ({100 * share:.0f} %), and is largest about {largest}"
