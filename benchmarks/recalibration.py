@@ -259,7 +259,7 @@ def a_year(job: tuple[str, float, int]) -> tuple[float, ...]:
         changed = said.held(1.0, step=True)
         rejected = changed and said.p < 0.01
         held = changed or said.held(1.0)
-        told = len(rows) > 4 and said.creeps(0.5)
+        told = len(rows) > 4 and said.creeps(1.0, 0.5)
         sound.append(not (held or told) and said.p >= 0.01 and said.beyond(0.5) <= 0.5)
         rejects[week] = rejected
         if held:

@@ -8,10 +8,14 @@
 `load` starts `reseau serve` with a bench whose camera has a clock of its own: a frame each half second, and
 whoever asks too late misses one. A session takes them all, while 200 clients read server-sent events and
 requests arrive at a constant rate, whether earlier ones are answered or not. A frame is lost if its number is
-missing in the archive, and late if it is stored after the next one is due. The time of a request counts from
-the moment at which it was due. Clients check that no event is missing or repeated. The memory of service
-and worker (what is resident, without pages of files) is flat if the straight line through the second half of
-the run rises by less than 1 MB. With `--frames` the session has so many frames already, as after hours.
+missing in the archive, and late if it is stored after the next one is due. The camera counts what it dropped,
+as transports do, and for how long its process waited for a processor before; how long a write to the disk
+takes is measured all the time. A frame that would have been asked for in time without these waits is lost for
+want of the machine, and counted apart; any other one, or one that the camera did not drop, is a fault. The
+time of a request counts from the moment at which it was due. Clients check that no event is missing or
+repeated. The memory of service and worker (what is resident, without pages of files) is flat if the straight
+line through the second half of the run rises by less than 1 MB. With `--frames` the session has so many
+frames already, as after hours.
 
 `sessions` fills an archive as after years: sessions with frames and results, configurations with decisions,
 an audit log. It takes the time and the processor time of pages and operations: at first at most 1 s each,
@@ -122,6 +126,8 @@ class Load:
         self.seconds: dict[str, list[float]] = {}
         self.statuses: Counter[int] = Counter()
         self.missing = self.repeated = self.received = self.failed = 0
+        self.flushes: list[tuple[float, float]] = []
+        """When each write to the disk began and ended."""
         self.over = False
 
     async def request(self, path: str, due: float) -> None:
@@ -182,18 +188,33 @@ class Load:
                 found.setdefault(name, []).append(now)
             await asyncio.sleep(10.0)
 
+    async def disk(self, folder: Path) -> None:
+        """Write to the disk of the archive four times a second, and again at once where it takes long."""
+
+        def flush() -> None:
+            with (folder / "probe").open("ab") as file:
+                file.write(b".")
+                file.flush()
+                os.fsync(file.fileno())
+
+        while True:
+            begun = time.time()
+            await asyncio.to_thread(flush)
+            self.flushes.append((begun, time.time()))
+            await asyncio.sleep(max(0.02, begun + 0.25 - time.time()))
+
     async def run(
-        self, clients: int, rate: float, seconds: float, processes: dict[str, psutil.Process]
+        self, clients: int, rate: float, seconds: float, processes: dict[str, psutil.Process], folder: Path
     ) -> dict[str, list[tuple[float, float]]]:
         """Put the service under load; return the memory of the processes."""
         found: dict[str, list[tuple[float, float]]] = {}
         streams = [asyncio.create_task(self.events()) for _ in range(clients)]
         await asyncio.sleep(2.0)
-        watch = asyncio.create_task(self.memory(processes, found))
+        watches = [asyncio.create_task(each) for each in (self.memory(processes, found), self.disk(folder))]
         await self.requests(rate, seconds)
-        for each in (watch, *streams):
+        for each in (*watches, *streams):
             each.cancel()
-        await asyncio.gather(watch, *streams, return_exceptions=True)
+        await asyncio.gather(*watches, *streams, return_exceptions=True)
         return found
 
 
@@ -220,16 +241,17 @@ def load(minutes: float, clients: int, rate: float, already: int) -> int:
             filled(folder, already)
             time.sleep(5.0)
             first = frames_of(folder, 0)[2]
+            (folder / clocked.MISSED).unlink(missing_ok=True)
             before = {each: sum(each.cpu_times()[:2]) for each in (service, worker)}
             made = Load(port, token)
             memory = asyncio.run(
-                made.run(clients, rate, 60 * minutes, {"service": service, "worker": worker})
+                made.run(clients, rate, 60 * minutes, {"service": service, "worker": worker}, folder)
             )
             spent = [sum(each.cpu_times()[:2]) - before[each] for each in (service, worker)]
             http.post("/benches/cellar/abort").raise_for_status()
             while http.get("/benches/cellar").json()["state"] != "ready":
                 time.sleep(0.1)
-        lost, late, frames, delays = frames_of(folder, first)
+        (lost, late, frames, delays), wanting = frames_of(folder, first), machine_of(folder, made.flushes)
     every = sorted(each for times in made.seconds.values() for each in times)
     p50, p99 = (1e3 * every[int(q * (len(every) - 1))] for q in (0.5, 0.99))
     print(f"{minutes:g} min, {clients} clients of events, {rate:g} requests/s, {os.cpu_count()} cores")
@@ -240,7 +262,9 @@ def load(minutes: float, clients: int, rate: float, already: int) -> int:
         print(f"  {path:38} median {1e3 * statistics.median(times):6.1f} ms, "
               f"p99 {1e3 * times[int(0.99 * (len(times) - 1))]:6.1f} ms")  # fmt: skip
     print(f"events        {made.received} received, {made.missing} missing, {made.repeated} repeated")
-    print(f"frames        {frames}: {lost} lost, {late} late; stored after "
+    faults = sum(number not in wanting for number in lost + late)
+    print(f"frames        {frames}: {len(lost)} lost, {len(late)} late, of these {faults} by a fault and the "
+          f"others for want of processor or disk; stored after "
           f"{1e3 * statistics.median(delays):.0f} ms (median), "
           f"{1e3 * max(delays):.0f} ms (longest)")  # fmt: skip
     print(f"processor     service {1e3 * spent[0] / len(every):.1f} ms per request with events, "
@@ -254,7 +278,7 @@ def load(minutes: float, clients: int, rate: float, already: int) -> int:
               f"{grown:+.2f} ± {sigma:.2f} MB in the last {seconds / 60:.0f} min")  # fmt: skip
     kept = (
         p99 < 200
-        and not (made.failed or lost or late or made.missing or made.repeated)
+        and not (made.failed or faults or made.missing or made.repeated)
         and set(made.statuses) == {200}
     )
     print("kept" if kept and flat else "NOT KEPT")
@@ -294,8 +318,8 @@ def filled(folder: Path, count: int) -> None:
                 connection.execute(sa.insert(schema.verdicts), verdicts)
 
 
-def frames_of(folder: Path, after: int) -> tuple[int, int, int, list[float]]:
-    """Frames after the first ones: how many are lost, late, there; and the times until they were stored."""
+def frames_of(folder: Path, after: int) -> tuple[list[int], list[int], int, list[float]]:
+    """Frames after the first ones: lost and late ones, how many are there, and the times until stored."""
     with Archive.open(folder / "archive") as archive:
         found = archive.session("load").frames(kind="frame")[after:]
         with archive._engine.connect() as connection:
@@ -306,8 +330,23 @@ def frames_of(folder: Path, after: int) -> tuple[int, int, int, list[float]]:
         taken = datetime.fromtimestamp(each.clock["sequence"][0] * clocked.PERIOD_S, UTC)
         at = stored[each.id]
         delays.append(((at if at.tzinfo else at.replace(tzinfo=UTC)) - taken).total_seconds())
-    lost = numbers[-1] - numbers[0] + 1 - len(set(numbers))
-    return lost, sum(each > clocked.PERIOD_S for each in delays), len(found), delays
+    lost = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers)) if numbers else []
+    late = [number for number, each in zip(numbers, delays, strict=True) if each > clocked.PERIOD_S]
+    return lost, late, len(found), delays
+
+
+def machine_of(folder: Path, flushes: list[tuple[float, float]]) -> set[int]:
+    """Numbers of frames that would have been in time, had the worker not waited for processor or disk."""
+    missed, found = folder / clocked.MISSED, set[int]()
+    for row in map(json.loads, missed.read_text().splitlines() if missed.is_file() else ()):
+        begun = row["after"] * clocked.PERIOD_S
+        end = begun + row["gap"]
+        disk = sum(max(0.0, min(end, after) - max(begun, before)) for before, after in flushes)
+        print(f"missed        {row['gap']:.2f} s after frame {row['after']}, waits for a processor "
+              f"{row['processor']:.2f} s, for the disk {disk:.2f} s")  # fmt: skip
+        if row["gap"] - row["processor"] - disk < clocked.PERIOD_S:
+            found |= set(range(row["after"], int(end / clocked.PERIOD_S) + 1))
+    return found
 
 
 FRAMES, CONFIGURATIONS, DECISIONS, RECORDED = 20, 5, 52, 2000

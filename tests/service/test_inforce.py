@@ -368,6 +368,20 @@ def test_a_creeping_drift_is_announced_and_held_back_and_counts_from_the_referen
     assert known.decide("left", camera(**values, name="again"), RULES, since=day(91)).outcome != "rejected"
 
 
+def test_a_season_is_told_beside_a_trend_until_it_has_turned(archive: Archive) -> None:
+    known, _ = started(archive)
+    rng, said = np.random.default_rng(5), list[str]()
+    for k in range(1, 27):  # a yearly swing of 0.25 px, of which 0.4 px are allowed
+        values = {key: FIRST[key] + 4 * SIGMA[key] * rng.normal() for key in SIGMA}
+        values["c"] += 0.005 * np.sin(2 * np.pi * 7 * k / 365.25)
+        made = known.decide("left", camera(scale=4.0, **values), RULES, since=day(7 * k))
+        assert made.outcome in ("accepted", "accepted with warning")
+        said.append("; ".join(f.text for f in made.judgement.findings if f.rule == "trend"))
+    assert any(said[:13])
+    assert all("follows the seasons" in each and "; or creeps by" in each for each in said if each)
+    assert not any(said[13:])
+
+
 def test_a_stable_camera_is_accepted(archive: Archive) -> None:
     known, _ = started(archive)
     rng, found = np.random.default_rng(6), []

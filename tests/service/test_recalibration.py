@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -419,3 +420,43 @@ def test_alarms_that_cannot_be_delivered_are_sent_later(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="could not be delivered"):
             alarms.send(lambda title, text: False, day, start)
         assert len(alarms.send(lambda title, text: True, day, start)) == 1
+
+
+_SENDER = """
+import os, sys, time
+from datetime import UTC, datetime, timedelta
+from reseau.archive import Archive
+from reseau.service import Alarms
+place, told, begin, day = sys.argv[1:]
+def deliver(title, text):
+    if told == "killed":
+        os._exit(9)
+    time.sleep(0.05)
+    with open(told, "a") as file:
+        file.write(text + chr(10))
+    return True
+with Archive.open(place) as archive:
+    alarms = Alarms(archive)
+    time.sleep(max(0.0, float(begin) - time.time()))
+    alarms.send(deliver, timedelta(days=1), datetime(2026, 3, int(day), tzinfo=UTC))
+"""
+
+
+def test_two_services_on_one_archive_send_each_alarm_once(tmp_path: Path) -> None:
+    place, day = tmp_path / "archive", timedelta(days=1)
+    command = [sys.executable, "-c", _SENDER, place]
+    with Archive.open(place, create=True) as archive:
+        known, names = Configurations(archive), [f"camera {number}" for number in range(12)]
+        for name in names:
+            known.define(name, {"camera": name})
+            known.decide(name, camera(), CAMERA_RULES, since=datetime(2026, 3, 1, tzinfo=UTC))
+        at_once = [tmp_path / "told.txt", str(time.time() + 4), "3"]
+        senders = [subprocess.Popen([*command, *at_once]) for _ in range(2)]
+        assert [each.wait(60) for each in senders] == [0, 0]
+        told = [each.partition(":")[0] for each in (tmp_path / "told.txt").read_text().splitlines()]
+        assert sorted(told) == sorted(names)
+        # What a process was sending when it was killed, another one sends once that must have ended.
+        assert subprocess.run([*command, "killed", "0", "20"], check=False).returncode == 9
+        alarms, killed = Alarms(archive), datetime(2026, 3, 20, tzinfo=UTC)
+        assert alarms.send(lambda title, text: True, day, killed + timedelta(seconds=120)) == []
+        assert len(alarms.send(lambda title, text: True, day, killed + timedelta(seconds=300))) == 12

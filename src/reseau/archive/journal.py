@@ -104,13 +104,13 @@ class Journal:
             number = connection.scalar(insert)
         return None if number is None else Entry(number, key, kind, content, time)
 
-    def add(self, kind: str, document: Mapping[str, Any]) -> Entry:
+    def add(self, kind: str, document: Mapping[str, Any], at: datetime | None = None) -> Entry:
         """Append an entry whose key is its kind and the next free number.
 
         Parameters
         ----------
-        kind, document
-            See :class:`Entry`.
+        kind, document, at
+            As for :meth:`append`.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class Journal:
             If the archive cannot store it.
         """
         number = len(self.entries())
-        while (made := self.append(f"{kind} {number}", kind, document)) is None:
+        while (made := self.append(f"{kind} {number}", kind, document, at)) is None:
             number += 1
         return made
 

@@ -130,7 +130,8 @@ def _read(data: bytes, where: object) -> tuple[dict[str, Any], NDArray[Any]]:
     import tifffile
 
     try:
-        with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+        # The library's objects refer to one another: without its end the stream would keep the file for long.
+        with io.BytesIO(data) as stream, tifffile.TiffFile(stream) as tiff:
             page = tiff.pages.first
             about = json.loads(page.description)
             pixels = page.asarray()

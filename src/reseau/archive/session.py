@@ -23,6 +23,9 @@ from .records import ArchivedFrame, ArchivedResult, Verdict, utc, utc_now
 
 INPUT = "input"
 """Kind of the input files of a session."""
+_GIVEN = schema.verdicts.alias()
+_GOOD_STEPS = sa.func.count(sa.distinct(sa.case((schema.verdicts.c.ok, schema.frames.c.step))))
+"""Parts of queries; made for each query they would be garbage that only a search for cycles finds."""
 
 
 class _Stored(NamedTuple):
@@ -248,7 +251,7 @@ class Session:
 
     def _judged(self, query: Any, *where: sa.ColumnElement[bool]) -> Any:
         """Make a query one of pictures of this session, each with its last verdict."""
-        f, v, given = schema.frames.c, schema.verdicts.c, schema.verdicts.alias().c
+        f, v, given = schema.frames.c, schema.verdicts.c, _GIVEN.c
         latest = sa.select(sa.func.max(given.id)).where(given.frame_id == f.id).scalar_subquery()
         joined: Any = query.select_from(schema.frames).outerjoin(schema.verdicts, v.id == latest)
         return joined.where(f.session_id == self._id, *where)
@@ -300,9 +303,7 @@ class Session:
 
     def counts(self) -> tuple[int, int]:
         """Return the number of frames, and that of steps with a good one."""
-        f, v = schema.frames.c, schema.verdicts.c
-        good = sa.func.count(sa.distinct(sa.case((v.ok, f.step))))
-        query = self._judged(sa.select(sa.func.count(), good), f.kind == "frame")
+        query = self._judged(sa.select(sa.func.count(), _GOOD_STEPS), schema.frames.c.kind == "frame")
         with schema.connected(self._engine, reading=True) as connection:
             taken, steps = connection.execute(query).one()
         return taken, steps

@@ -2,7 +2,8 @@
 
 Alarms are not raised by the code in which something happens. They are collected from what the archive says:
 runs that were missed or failed, calibrations that were rejected or need a review, charts that signal. Each
-has a key; what was sent and what was acknowledged are entries of a journal.
+has a key; what was sent and what was acknowledged are entries of a journal. Of several processes that send
+alarms of one archive, the database lets one claim each sending.
 """
 
 from __future__ import annotations
@@ -13,19 +14,18 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import ClassVar
-
-from pydantic import Field
 
 from ..archive import Archive
+from ..archive.journal import Entry
 from ..core.errors import InputError, UsageError
 from ..core.optional import optional
-from ..io import Document
-from .delivering import networks_of
+from .delivering import AlarmDelivery, networks_of
 from .inforce import Configurations, a_time
 from .schedule import Schedules
 
 _JOURNAL, _LONGEST_S = "alarms", 120.0
+_CLAIM = timedelta(seconds=2 * _LONGEST_S)
+"""For how long others leave alarms to a sender that may have ended: longer than a message takes."""
 
 
 @dataclass(frozen=True)
@@ -55,31 +55,6 @@ class Alarm:
     acknowledged: str = ""
 
 
-class AlarmDelivery(Document):
-    """Where a service sends alarms, ``reseau-alarm-delivery/1``.
-
-    Parameters
-    ----------
-    notify : tuple of str
-        Addresses to which alarms are sent, as mailtos://user:password@example.org (URLs of apprise).
-    inside : tuple of str
-        Networks of the laboratory to which they may be sent, such as 192.168.1.0/24.
-    repeat_hours : float
-        Time after which an alarm that nobody acknowledged is sent again (h).
-
-    Examples
-    --------
-    >>> AlarmDelivery(notify=("mailto://user:password@example.org",)).repeat_hours
-    24.0
-    """
-
-    SCHEMA: ClassVar[str] = "reseau-alarm-delivery/1"
-
-    notify: tuple[str, ...] = ()
-    inside: tuple[str, ...] = ()
-    repeat_hours: float = Field(default=24.0, ge=0.1, le=8760)
-
-
 class Alarms:
     """Alarms of an archive.
 
@@ -101,7 +76,9 @@ class Alarms:
 
     def all(self, now: datetime | None = None) -> list[Alarm]:
         """Return all alarms with what was sent and acknowledged."""
-        entries = self._journal.entries()
+        return self._all(self._journal.entries(), now)
+
+    def _all(self, entries: Sequence[Entry], now: datetime | None) -> list[Alarm]:
         sent = [(each.document["alarm"], each.at) for each in entries if each.kind == "sent"]
         seen = {
             each.document["alarm"]: each.document["by"] for each in entries if each.kind == "acknowledged"
@@ -177,18 +154,39 @@ class Alarms:
         InputError
             If they could not be delivered; they are sent with the next call.
         """
-        time = a_time(now or self._archive.clock())
-        due = [each for each in self.open(time) if not each.sent or each.sent[-1] + repeat <= time]
+        time, entries = a_time(now or self._archive.clock()), self._journal.entries()
+        due = [
+            each
+            for each in self._all(entries, time)
+            if not each.acknowledged
+            and (not each.sent or each.sent[-1] + repeat <= time)
+            and self._claimed(each, entries, time)
+        ]
         if not due:
             return []
         plural = "s" if len(due) > 1 else ""
         lines = [each.text + (" (repeated)" if each.sent else "") for each in due]
-        if not deliver(f"reseau: {len(due)} alarm{plural}", "\n".join(lines)):
-            raise InputError("could not be delivered", where="alarms", do="check the addresses")
-        for each in due:
-            document = {"alarm": each.key}
-            self._journal.append(f"sent {len(each.sent) + 1} {each.key}", "sent", document, time)
+        kind = "unsent"
+        try:
+            if not deliver(f"reseau: {len(due)} alarm{plural}", "\n".join(lines)):
+                raise InputError("could not be delivered", where="alarms", do="check the addresses")
+            kind = "sent"
+        finally:
+            for each in due:
+                self._journal.add(kind, {"alarm": each.key}, time)
         return due
+
+    def _claimed(self, alarm: Alarm, entries: Sequence[Entry], time: datetime) -> bool:
+        """Whether this process sends an alarm, by what was known when it was found due.
+
+        The claims of an alarm are numbered: of two processes that know the same ones, one makes the next.
+        """
+        own = [each for each in entries if each.document.get("alarm") == alarm.key]
+        claims = [each for each in own if each.kind == "claimed"]
+        if claims and own[-1].kind == "claimed" and claims[-1].at + _CLAIM > time:
+            return False
+        key = f"claimed {len(claims) + 1} {alarm.key}"
+        return self._journal.append(key, "claimed", {"alarm": alarm.key}, time) is not None
 
     def _runs(self, now: datetime | None) -> dict[str, str]:
         """Alarms about runs, by key; an overdue run that is then missed is one event."""

@@ -12,10 +12,40 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any, ClassVar
+
+from pydantic import Field
+
+from ..io import Document
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 _PROXIES = ("http_proxy", "https_proxy", "all_proxy", "ftp_proxy")
+
+
+class AlarmDelivery(Document, defer_build=False):
+    """Where a service sends alarms, ``reseau-alarm-delivery/1``.
+
+    Parameters
+    ----------
+    notify : tuple of str
+        Addresses to which alarms are sent, as mailtos://user:password@example.org (URLs of apprise).
+    inside : tuple of str
+        Networks of the laboratory to which they may be sent, such as 192.168.1.0/24.
+    repeat_hours : float
+        Time after which an alarm that nobody acknowledged is sent again (h).
+
+    Examples
+    --------
+    >>> AlarmDelivery(notify=("mailto://user:password@example.org",)).repeat_hours
+    24.0
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-alarm-delivery/1"
+
+    # Content of a request, too: it has lists, and is a body that must be built when it is declared.
+    notify: tuple[Annotated[str, Field(max_length=500)], ...] = Field(default=(), max_length=10, strict=False)
+    inside: tuple[Annotated[str, Field(max_length=50)], ...] = Field(default=(), max_length=10, strict=False)
+    repeat_hours: float = Field(default=24.0, ge=0.1, le=8760)
 
 
 def networks_of(texts: Sequence[str]) -> tuple[Network, ...]:

@@ -7,7 +7,7 @@ began, are unknown; what is said of the present drift is the mean over all of th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -15,12 +15,9 @@ import scipy.special
 
 from ..core.data import Array
 
-_LOSS = 10.0
-"""What it costs to accept by mistake, by what it costs to hold back by mistake: allowed in 1 % of the years,
-and 0.1 times a year."""
-_LATE = 5.0
-"""What it costs to announce a trend late, by what it costs to announce one that is none: one stable run in 20
-may have a warning, and a quarter of these may be of trends."""
+_MISSED, _FALSE, _WARNED = 0.01, 0.1, 0.05
+"""Mistakes that are allowed: years with a run accepted beyond the limit, or with a trend announced late; runs
+held back by mistake, a year; stable runs with a warning. The rarer one may be, the more it costs."""
 _SCALES = np.array([1.0, 1.5, 2.2, 3.3, 5.0])
 """Scales of the errors between runs, in the standard deviations that the calibrations state."""
 _HOLD = 8.0
@@ -31,6 +28,8 @@ _AHEAD = np.append(0.0, np.geomspace(1.0, 36525.0, 300))[:, None]
 """Times at which a drift may reach its limit, days."""
 _YEAR = 365.25
 """Period of seasons, days."""
+_SEASONS = np.linspace(0.0, _YEAR, 25)
+"""Times ahead at which a drift that follows the seasons is predicted, days."""
 _WIDTHS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
 """Sizes τ of changes (rms over the image), in limits, all equally probable."""
 
@@ -150,6 +149,10 @@ class History:
     _step: Array
     _growth: Array
     """Growth of the drift a day by each model, in parts of the drift."""
+    _seasonal: Array
+    """Which models follow the seasons."""
+    _ahead: Array
+    """Sizes, and standard deviations, that they predict at times ahead."""
 
     def beyond(self, limit: float, *, step: bool = False) -> float:
         """Return the probability that the drift, or the step from the run in force, exceeds a limit."""
@@ -165,16 +168,29 @@ class History:
         margin = 2 * self.sigma
         above = self.beyond(limit + margin, step=step)
         below = 1 - self.beyond(max(limit - margin, 0.0), step=step)
-        return _LOSS * above > below
+        return above / _MISSED > below / _FALSE
 
-    def creeps(self, size: float) -> bool:
-        """Return whether a trend should be announced: that the drift has reached a size little by little.
+    def creeps(self, limit: float, part: float) -> bool:
+        """Return whether to announce that the drift, which has reached a part of the limit, will reach it.
 
-        It should where to say it late would be dearer than to say it in vain, and a change at once is less
-        probable.
+        A drift that creeps will, one that follows the seasons may, and no other one grows. It is announced
+        where to say it late would be dearer than to say it in vain.
         """
-        there = self.beyond(size)
-        return self.creeping + self.seasonal > self.changed and _LATE * there > 1 - there
+        (size, sigma), least = self._total, np.full(len(self._weights), limit * part)
+        there = self._weights * scipy.special.ndtr((size - least) / np.maximum(sigma, 1e-300))
+        will = float(there[self._growth > 0].sum() + there[self._seasonal] @ self._within_a_year(limit)[-1])
+        return will / _MISSED > (1 - will) / _WARNED
+
+    def _within_a_year(self, limit: float) -> Array:
+        """Probabilities (time ahead, model) that a drift that follows the seasons has reached a limit."""
+        size, sigma = self._ahead
+        reached = scipy.special.ndtr((size - limit) / np.maximum(sigma, 1e-300))
+        return np.asarray(np.maximum.accumulate(reached), dtype=np.float64)
+
+    def turns(self) -> tuple[float, float]:
+        """Return in how many days the drift is largest, if it follows the seasons, and its size then."""
+        mean = self._ahead[0] @ self._weights[self._seasonal] / max(self.seasonal, 1e-300)
+        return float(_SEASONS[np.argmax(mean)]), float(mean.max())
 
     @property
     def rate_day(self) -> float:
@@ -243,7 +259,8 @@ def explain_runs(runs: RunHistory, limit: float, in_force: int) -> History:
     )
     return History(
         stable, creeps, changed, seasonal, scale, sigma, float(scipy.special.chdtrc(r, statistic)), log,
-        weights, total, step, np.concatenate([each.growth for each in found]),
+        weights, total, step, np.concatenate([each.growth for each in found]), kinds == 3,
+        np.concatenate([each.ahead for each in found], axis=2),
     )  # fmt: skip
 
 
@@ -257,6 +274,8 @@ class _Supposed:
     total: Array
     step: Array
     growth: Array
+    ahead: Array = field(default_factory=lambda: np.zeros((2, len(_SEASONS), 0)))
+    """Of the seasons, the drift that is predicted (2, time, model)."""
 
     @classmethod
     def stable(cls, common: Array) -> Self:
@@ -296,8 +315,9 @@ def _supposed(
 
     def sizes(part: Array) -> Array:
         """Largest changes over the image, and their standard deviations, of parts (k, p) of the functions."""
-        fields = np.einsum("mci,ai,kp,akpij->akmcj", runs.basis, sigma, part, to_field, optimize=True)
-        return _greatest(fields, mean, cov)
+        u = np.broadcast_to(to_field, (2, len(part), *to_field.shape[2:]))
+        fields = np.einsum("mci,ai,kp,akpij->akmcj", runs.basis, sigma, part, u, optimize=True)
+        return _greatest(fields, *(np.broadcast_to(e, (2, len(part), *e.shape[2:])) for e in (mean, cov)))
 
     now, count = shapes[:, :, -1], len(_SCALES) * len(_WIDTHS)
     if p == 1:  # what is said of one function is in proportion
@@ -306,7 +326,11 @@ def _supposed(
     else:
         total, step = sizes(now), sizes(now - shapes[:, :, in_force])
     scale = np.broadcast_to(_SCALES[:, None], log.shape).ravel()
-    return _Supposed(kind, log.ravel(), scale, total, step, np.tile(np.repeat(growth, count), 2))
+    made = _Supposed(kind, log.ravel(), scale, total, step, np.tile(np.repeat(growth, count), 2))
+    if kind != 3:
+        return made
+    ahead = sizes(_season(runs.days[-1] - runs.days[0] + _SEASONS).T).reshape(2, 2, len(_SEASONS), count)
+    return replace(made, ahead=ahead.swapaxes(1, 2).reshape(2, len(_SEASONS), -1))
 
 
 def _profiles(days: Array) -> dict[int, tuple[Array, Array]]:
@@ -321,9 +345,14 @@ def _profiles(days: Array) -> dict[int, tuple[Array, Array]]:
     found = {2: (at_once[:, None], np.zeros(n - 1))}
     if n > 2:
         found[1] = rising[:, None], 1 / left
-        year = 2 * np.pi * days / _YEAR
-        found[3] = np.array([[np.sin(year), 1 - np.cos(year)]]), np.zeros(1)
+        found[3] = _season(days)[None], np.zeros(1)
     return found
+
+
+def _season(days: Array) -> Array:
+    """The functions (2, n) of time of what follows the seasons, 0 at the reference."""
+    year = 2 * np.pi * days / _YEAR
+    return np.array([np.sin(year), 1 - np.cos(year)])
 
 
 def _greatest(fields: Array, mean: Array, cov: Array) -> Array:

@@ -47,6 +47,8 @@ _RESOLVED = 2.0
 _MORE_LIKELY = 0.5
 _ANNOUNCED, _RUNS = 0.5, 4
 """Part of the limit from which on, and runs after which, a trend is announced."""
+_MENTIONED = 0.05
+"""Probability from which on another explanation of a trend is said, as the quantiles of its date are."""
 
 
 class Limits(Strict):
@@ -308,11 +310,17 @@ def _since_reference(
     text += f"limits {limits.warning:g} and {limits.action:g} {unit}"
     found = [_finding("drift", level, size, limits, text)]
     days = said.reaches(limits.action, 0.05, 0.5, 0.95)
-    if count > _RUNS and said.creeps(_ANNOUNCED * limits.action) and days[1] > 0:
-        first, about, last = ((now + timedelta(days=each)).date() for each in days)
-        text = f"creeps by {7 * said.rate_day:.2g} {unit} a week, and reaches the limit of "
-        text += f"{limits.action:g} {unit} about {about} ({first} to {last})"
-        found.append(_finding("trend", "warning", size, limits, text))
+    if count > _RUNS and said.creeps(limits.action, _ANNOUNCED) and days[1] > 0:
+        turn, most = said.turns()
+        first, about, last, largest = ((now + timedelta(days=each)).date() for each in (*days, turn))
+        texts = [
+            f"creeps by {7 * said.rate_day:.2g} {unit} a week, and reaches the limit of "
+            f"{limits.action:g} {unit} about {about} ({first} to {last})"
+        ]
+        if (share := said.seasonal / (said.creeping + said.seasonal)) > _MENTIONED:
+            season = f"follows the seasons ({100 * share:.0f} %), and is largest about {largest}"
+            texts.insert(int(share < _MORE_LIKELY), f"{season}, {most:.2g} {unit}")
+        found.append(_finding("trend", "warning", size, limits, "; or ".join(texts)))
     return found
 
 

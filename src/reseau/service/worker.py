@@ -516,11 +516,11 @@ class Worker:
             if self._held is not None and self._sessions.control is None:
                 self._reconnect()
 
-    def _points(self, frame: Any) -> list[list[float]]:
-        """Targets found in a frame, where a session of this bench says which target there is."""
+    def _points(self, frame: Any) -> list[list[float]] | None:
+        """Targets found in a frame; None unless a session of this bench says which target there is."""
         measure = self._measurer()
         if measure is None:
-            return []
+            return None
         try:
             found = measure(frame)
         except ReseauError:

@@ -8,10 +8,10 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import Field
 
-from ..accounts import Principal, Scope
+from ..accounts import Principal, Scope, Token, User
 from ..attempts import RefusedLogin
 from .access import Administering, Forbidden, Here, NotFound, Operating, Reading, by_cookie, csrf_of
-from .answers import Answer, Done, Instant, refusals
+from .answers import Answer, Done, refusals
 
 router = APIRouter(tags=["accounts"], responses=refusals(400, 401, 403, 422, 503))
 
@@ -68,32 +68,12 @@ class NewUser(
     scope: Scope = "read"
 
 
-class UserAnswer(Answer):
-    """A user, without secrets."""
-
-    name: str
-    scope: Scope
-    one_time: bool
-    created: Instant
-
-
 class NewToken(Confirmed, json_schema_extra={"example": {"name": "plotter", "scope": "read", "days": 90}}):
     """A token of mine, which may do at most what I may."""
 
     name: str = Field(min_length=1, max_length=80)
     scope: Scope = "read"
     days: int = Field(default=90, ge=1, le=731)
-
-
-class TokenAnswer(Answer):
-    """A token, without its secret."""
-
-    name: str
-    scope: Scope
-    user: str
-    created: Instant
-    expires: Instant
-    revoked: Instant | None
 
 
 class Secret(Answer):
@@ -218,9 +198,9 @@ def confirm_code(given: Code, who: Reading, service: Here) -> Done:
 
 
 @router.get("/users")
-def users(who: Administering, service: Here) -> list[UserAnswer]:
+def users(who: Administering, service: Here) -> list[User]:
     """All users."""
-    return [UserAnswer.model_validate(each) for each in service.accounts.users()]
+    return service.accounts.users()
 
 
 @router.post("/users", status_code=201, responses=refusals(429))
@@ -242,13 +222,9 @@ def remove_user(request: Request, name: Named, given: Confirmed, who: Administer
 
 
 @router.get("/tokens")
-def tokens(who: Reading, service: Here) -> list[TokenAnswer]:
+def tokens(who: Reading, service: Here) -> list[Token]:
     """My tokens, also those that have ended; without their secrets. Administrators see all."""
-    return [
-        TokenAnswer.model_validate(each)
-        for each in service.accounts.tokens()
-        if each.user == who.name or who.may("administer")
-    ]
+    return [each for each in service.accounts.tokens() if each.user == who.name or who.may("administer")]
 
 
 @router.post("/tokens", status_code=201, responses=refusals(429))

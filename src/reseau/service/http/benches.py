@@ -157,7 +157,7 @@ class PictureFacts(Answer):
     exposure: str = ""
     histogram: list[int] = Field(default_factory=list)
     at: str = ""
-    points: list[list[float]] = Field(default_factory=list)
+    points: list[list[float]] | None = Field(default=None, description="None: no target is known.")
     error: str = ""
 
 

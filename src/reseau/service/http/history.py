@@ -8,6 +8,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import Field
 
 from ...core.errors import UsageError
+from ..delivering import AlarmDelivery
 from .access import Administering, Here, NotFound, Operating, Reading
 from .answers import Answer, Done, Instant, refusals
 from .calibrations import SVG, the_configuration
@@ -139,14 +140,6 @@ class AlarmRow(Answer):
     text: str
     sent: list[Instant]
     acknowledged: str
-
-
-class Delivery(Answer, json_schema_extra={"example": {"notify": ["mailtos://lab:secret@example.org"]}}):
-    """Where alarms are sent, and after how long again."""
-
-    notify: list[Annotated[str, Field(max_length=500)]] = Field(default_factory=list, max_length=10)
-    inside: list[Annotated[str, Field(max_length=50)]] = Field(default_factory=list, max_length=10)
-    repeat_hours: float = Field(default=24.0, ge=0.1, le=8760)
 
 
 class Acknowledged(Answer):
@@ -370,14 +363,13 @@ def alarms(
 
 
 @router.put("/alarms/delivery")
-def deliver(given: Delivery, who: Administering, service: Here) -> Done:
+def deliver(given: AlarmDelivery, who: Administering, service: Here) -> Done:
     """Set where the service sends alarms."""
-    from ..alarms import AlarmDelivery, Alarms
+    from ..alarms import Alarms
 
-    made = AlarmDelivery.from_content({"schema": AlarmDelivery.SCHEMA, **given.model_dump()}, where="alarms")
-    with service.audited(who, "send alarms", "alarms", {"addresses": len(made.notify)}):
-        Alarms(service.archive).deliver_to(made)
-    return Done(done=f"sent to {len(made.notify)} addresses" if made.notify else "sent nowhere")
+    with service.audited(who, "send alarms", "alarms", {"addresses": len(given.notify)}):
+        Alarms(service.archive).deliver_to(given)
+    return Done(done=f"sent to {len(given.notify)} addresses" if given.notify else "sent nowhere")
 
 
 @router.post("/alarms/acknowledge")

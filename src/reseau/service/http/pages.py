@@ -414,7 +414,8 @@ def files_page(request: Request, who: Reading, service: Here) -> Response:
 @router.get("/history")
 def history_page(request: Request, who: Reading, service: Here) -> Response:
     """Alarms, reviews, schedules and drift."""
-    from ..alarms import AlarmDelivery, Alarms
+    from ..alarms import Alarms
+    from ..delivering import AlarmDelivery
     from ..recalibration import Recalibration
 
     sent_to = Alarms(service.archive).delivery.to_dict() if who.may("administer") else {}

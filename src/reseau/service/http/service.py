@@ -49,8 +49,8 @@ def _load_the_rest(over: threading.Event) -> None:
 
 
 _LOOK_S, _ENTRY_S, _REST_S = 0.3, 600.0, 3.0
-_ALARMS_S = 30.0
-"""Time between looks at alarms that are to be sent."""
+_ALARMS_S, _AGAIN_S = 30.0, 600.0
+"""Time between looks at alarms that are to be sent, and between attempts that fail: each is recorded."""
 _LOGGED = frozenset({"up", "down", "begin", "session", "end", "moving", "stopped", "asking"})
 """Events of benches that the log has, and not only the streams of events."""
 _MOST_COMPUTED = 200
@@ -272,10 +272,14 @@ class Service:
         """Send alarms as it is set; what could not be sent is said on the page, and tried again."""
         from ..alarms import Alarms
 
+        known, failed, again = Alarms(self.archive), None, 0.0
         while not self._over.wait(_ALARMS_S):
             try:
-                Alarms(self.archive).send_as_set()
-                self.unsent = ""
+                if (to := known.delivery) == failed and time.monotonic() < again:
+                    continue
+                failed, again = to, time.monotonic() + _AGAIN_S
+                known.send_as_set()
+                self.unsent, failed = "", None
             except Exception as error:  # whatever it is, the next alarm is sent, too
                 log("alarms", failed=str(error))
                 self.unsent = str(error)

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 
 from ...archive import Session
-from ...archive.records import ArchivedFrame, ArchivedResult
+from ...archive.records import ArchivedFrame, ArchivedResult, SessionSummary
 from ...core.errors import ArchiveError, ReseauError, UsageError
 from ...report.scene import Scene
 from ..decoding import PHOTOGRAPH
@@ -23,17 +23,6 @@ router = APIRouter(tags=["sessions"], responses=refusals(400, 401, 403, 404, 422
 
 SessionName = Annotated[str, Path(max_length=200, description="Name of the session.")]
 Number = Annotated[int, Path(ge=1, le=1 << 62, description="Its number in the archive.")]
-
-
-class SessionRow(Answer):
-    """A line of the list of sessions."""
-
-    name: str
-    plan: str
-    begun: Instant
-    frames: int
-    results: int
-    status: str
 
 
 class SessionPage(
@@ -56,7 +45,7 @@ class SessionPage(
 ):
     """Sessions, latest first; `before` leads to the earlier ones."""
 
-    sessions: list[SessionRow]
+    sessions: list[SessionSummary]
     before: str | None
 
 
@@ -184,12 +173,9 @@ def _measurable(frame: ArchivedFrame) -> ArchivedFrame:
     return frame
 
 
-def rows(service: Service, count: int, before: str | None = None, like: str = "") -> list[SessionRow]:
+def rows(service: Service, count: int, before: str | None = None, like: str = "") -> list[SessionSummary]:
     """Return lines of the list, latest first."""
-    return [
-        SessionRow.model_validate(each)
-        for each in reversed(service.archive.sessions(last=count, before=before, like=like))
-    ]
+    return service.archive.sessions(last=count, before=before, like=like)[::-1]
 
 
 def _row(frame: ArchivedFrame) -> FrameRow:

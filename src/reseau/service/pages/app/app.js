@@ -372,8 +372,8 @@ if (picture) {
             image.hidden = false;
             shown = facts.number;
             over.setAttribute('viewBox', `-0.5 -0.5 ${facts.width} ${facts.height}`);
-            over.replaceChildren(...facts.points.map(([x, y]) => drawn('circle', {cx: x, cy: y, r: facts.width / 130})));
-            words.textContent = `exposure ${facts.exposure}; ${edges(facts.edge_px)}; ${facts.points.length} points found; ${facts.at.slice(11, 19)} UTC`;
+            over.replaceChildren(...(facts.points ?? []).map(([x, y]) => drawn('circle', {cx: x, cy: y, r: facts.width / 130})));
+            words.textContent = `exposure ${facts.exposure}; ${edges(facts.edge_px)}; ${facts.points ? `${facts.points.length} points found` : 'its target is not known before a first session'}; ${facts.at.slice(11, 19)} UTC`;
             aids.hidden = false;
             exposure(aids.querySelector('[data-exposure]'), facts.histogram);
             const least = focus(aids.querySelector('[data-focus]'), facts.edge_px);
