@@ -72,6 +72,7 @@ def _document(first: Path, second: Path, found: FieldDifference) -> dict[str, An
         "statistic": found.statistic,
         "degrees": found.degrees,
         "p": found.p,
+        "p_alone": found.p_alone,
         "rotation_rad": found.rotation.tolist(),
         "x": found.xy[0, :, 0].tolist(),
         "y": found.xy[:, 0, 1].tolist(),

@@ -13,6 +13,7 @@ import scipy
 from ...adjust.components import VarianceComponents
 from ...adjust.outliers import SnoopingStep
 from ...adjust.significance import CoefficientTest, GlobalTest, ratio_test
+from ...calibration.camera import Rival
 from ...core.data import Array, Mask, Rows
 from ...core.display import Display, Table
 from ...core.errors import UsageError
@@ -24,7 +25,7 @@ from ..network.network import Network
 from ..network.stage import perpendicular
 from ..solver.problem import BundleFit
 from ..solver.rank import missing_windows
-from .considered import Considered, Rival, considered
+from .considered import Considered, considered
 from .estimates import (
     CameraEstimate,
     ImageEstimates,
@@ -276,6 +277,10 @@ class Result(Estimated, Display):
         found = self._shared_uncertainty(columns)
         more = [each.errors(columns)[: len(columns), : len(columns)] for each in self._considered.values()]
         return found if not more else found.with_errors(np.sum(more, axis=0))
+
+    def rivals_of(self, c: int) -> tuple[Rival, ...]:
+        """Models of other kinds that a camera may have."""
+        return self.rivals[c] if self.rivals else ()
 
     def with_considered(
         self, c: int, names: tuple[str, ...], columns: Rows, covariance: Array
