@@ -245,7 +245,7 @@ def _mapping(model: Mapping[str, Any], values: Mapping[str, float]) -> PlaneMapp
         additional = additional_model(extra["model"])
         more = additional.build(np.zeros(len(additional.names)), extra["base_mm"])
     return registered.mapping(
-        np.array([values.get(name, 0.0) for name in registered.names]),
+        registered.column(values),
         PixelGrid(model["width"], model["height"], (model["pitch_mm"][0], model["pitch_mm"][1])),
         options_of(model),
         more,

@@ -143,7 +143,7 @@ class FieldDifference(Display):
         axes : matplotlib Axes, optional
             Axes to draw into; by default those of a new figure.
         """
-        from ..core.figures import ACCENT, INK, draw_contours, image_axes, new_axes, nice
+        from ..core.figures import ACCENT, INK, draw_arrows, draw_contours, image_axes, new_axes, nice
 
         axes = new_axes(axes)
         if np.nanmax(self.sigma) > 0:
@@ -157,10 +157,7 @@ class FieldDifference(Display):
         enlarged = nice(pitch / typical) if typical > 0 else 1.0
         for sure, colour in ((False, INK), (True, ACCENT)):
             chosen = np.isfinite(size) & ((p < _SURE) == sure)
-            axes.quiver(
-                *xy[chosen].T, *(enlarged * d[chosen]).T, color=colour, angles="xy", scale_units="xy",
-                scale=1, width=0.003, zorder=4,
-            )  # fmt: skip
+            draw_arrows(axes, xy[chosen], enlarged * d[chosen], colour, 0.003, zorder=4)
         title = f"difference × {enlarged:g} over its σ / px; longest {np.nanmax(size):.2g} px"
         width, height = (self.xy[-1, -1] + 1).tolist()
         image_axes(axes, width, height, title)

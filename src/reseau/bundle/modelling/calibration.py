@@ -70,8 +70,7 @@ def calibration_of(
         for key, value in (entry.parameters | dict(zip(names, values.tolist(), strict=True))).items()
     }
     dof = {"degrees_of_freedom": uncertain.degrees} if np.isfinite(uncertain.degrees) else {}
-    used = result.fit.usable.observations & ~result.rejected
-    xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
+    xy = result.network.xy[result.used_by(c)]
     targets = covariance_by_targets(result, c)
     targets = None if targets is None else np.pad(targets, (0, len(every) - len(names)))
     parts = {

@@ -24,6 +24,7 @@ from ...core.data import Array, Rows
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Code, Estimated, Failure
+from ...core.numbers import or_null
 from ...optics.cameras.registry import camera_model
 from ..diagnostics.checks import unmodelled_pattern
 from ..diagnostics.evidence import ODDS
@@ -145,23 +146,20 @@ class ModelChoice(Estimated, Display):
     def entries(self) -> list[dict[str, Any]]:
         """Return the comparison as JSON values for the calibration document; unknown numbers are null."""
 
-        def number(value: float) -> float | None:
-            return value if np.isfinite(value) else None
-
         return [
             {
                 "model": each.candidate.model,
                 "free": list(each.candidate.free),
                 "additional": each.candidate.additional,
                 "reason": each.reason,
-                "sigma0": number(each.sigma0),
-                "length": number(each.length),
-                "predicted": number(each.predicted),
-                "p": number(each.p),
-                "rms_px": number(each.rms_px),
-                "corner_px": number(each.corner_px),
-                "corner_sigma_px": number(each.corner_sigma_px),
-                "significant_share": number(each.share),
+                "sigma0": or_null(each.sigma0),
+                "length": or_null(each.length),
+                "predicted": or_null(each.predicted),
+                "p": or_null(each.p),
+                "rms_px": or_null(each.rms_px),
+                "corner_px": or_null(each.corner_px),
+                "corner_sigma_px": or_null(each.corner_sigma_px),
+                "significant_share": or_null(each.share),
             }
             for each in self.compared
         ]
