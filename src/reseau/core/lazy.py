@@ -35,7 +35,8 @@ def above(place: str) -> Any:
 def without_collecting() -> Iterator[None]:
     """Look for no circles of objects while many are made that stay: imports and compilers make so many.
 
-    Neither are they looked through later, or when Python ends.
+    Neither are they looked through when Python ends; where a process lives until old objects are looked
+    through, they are among these again, as are those that others had made before.
 
     Examples
     --------
@@ -45,14 +46,23 @@ def without_collecting() -> Iterator[None]:
     >>> gc.get_freeze_count() > 0
     True
     """
-    collects = gc.isenabled()
+    collects, kept = gc.isenabled(), gc.get_freeze_count() > 0
     gc.disable()
     try:
         yield
     finally:
         gc.freeze()
+        if not kept:
+            gc.callbacks.append(_thaw)
         if collects:
             gc.enable()
+
+
+def _thaw(phase: str, about: Mapping[str, int]) -> None:
+    """Look through everything again, unless Python ends."""
+    if phase == "start" and about["generation"] == 2 and not sys.is_finalizing():
+        gc.callbacks.remove(_thaw)
+        gc.unfreeze()
 
 
 def lazily(package: str, places: Mapping[str, str]) -> Callable[[str], Any]:
