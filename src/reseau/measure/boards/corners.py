@@ -291,7 +291,7 @@ class CornerMarks(PlaneMarks):
             part = np.flatnonzero((of.ravel() == k) & seen)
             if not len(part):
                 continue
-            nodes = polygons(corners[part], _NODES_PX * width[part].min()).oriented().single()
+            nodes = polygons(corners[part], _NODES_PX * width[part].min()).oriented()
             x, y = (low[part, i, None] + np.arange(n) for i, n in ((0, wide), (1, high)))
             taken = GrownOutline(nodes, np.zeros((0, 2, 2))).image(
                 np.zeros((len(part), 2)),
