@@ -10,6 +10,7 @@ import pytest
 from reseau.bundle import Result, adjust_network, calibration_of
 from reseau.bundle.diagnostics.fields import camera_mapping, projection_field_at
 from reseau.calibration import CameraMapping, FieldDifference, calibration_difference, projection_field
+from reseau.calibration.camera import Rival
 from reseau.core.errors import UsageError
 
 from ..montecarlo import draws, slowly, tolerance
@@ -82,6 +83,21 @@ def test_a_lens_that_changed_is_found_significant() -> None:
     cov = found.cov.copy()
     cov[0, 0] = np.nan  # no ray is imaged there
     assert np.flatnonzero(np.isnan(replace(found, cov=cov).p_at)).tolist() == [0]
+
+
+def test_where_the_model_is_open_a_difference_is_as_probable_as_the_pairs_of_models_make_it() -> None:
+    world = networks.world(points=40, datum="free", control=0)
+    lens, other = lens_of(world, 5), lens_of(world, 7)
+    off = replace(lens, mapping=lens.mapping.with_values({"c": 8.1}))
+    assert calibration_difference(off, other).p < 1e-6
+    # The right model had a probability of 0.2.
+    found = calibration_difference(replace(off, rivals=(Rival(0.2, lens),)), other)
+    alike = calibration_difference(lens, other)
+    assert found.p == pytest.approx(0.2 * alike.p, abs=1e-6)
+    assert (found.p_at >= 0.2 * alike.p_at).all()
+    assert found.p_alone < 1e-6
+    # One that is hardly probable does not make a difference more probable than it is.
+    assert calibration_difference(replace(lens, rivals=(Rival(0.2, off),)), other).p == alike.p
 
 
 def test_a_rotation_compensated_by_the_principal_point_is_no_difference() -> None:

@@ -15,6 +15,7 @@ from reseau.calibration import (
     FilmFrameMapping,
     calibration_of_frame,
 )
+from reseau.calibration.camera import Rival
 from reseau.calibration.document import Covariance, Quantity
 from reseau.calibration.reader import parse_calibration
 from reseau.calibration.sensor import Fields, SensorCorrection
@@ -48,6 +49,27 @@ def camera(**changes: object) -> Calibration:
         "validity": {"extent": [100.0, 80.0, 540.0, 400.0], "unit": "px"},
     }
     return Calibration(**(content | changes))  # type: ignore[arg-type]
+
+
+def test_models_of_other_kinds_are_read_as_they_were_written_and_refused_if_they_are_none() -> None:
+    given = camera()
+    model = {**given.model, "model": "fisheye"}
+    lens = CameraMapping.from_calibration(
+        camera(model=model, parameters=dict(list(given.parameters.items())[:6]))
+    )
+    entry = Rival(0.3, lens, model).entry()
+    again = CameraMapping.from_calibration(camera(validity={"rivals": [entry]})).rivals[0]
+    xy = np.array([[0.1, 0.2], [-0.3, 0.1]])
+    np.testing.assert_array_equal(again.lens.mapping(xy), lens.mapping(xy))
+    np.testing.assert_array_equal(again.lens.covariance, lens.covariance)
+    broken: list[object] = [
+        7, [3], [{**entry, "probability": 1.2}], [{**entry, "covariance": [[1.0]]}],
+        [{**entry, "model": {**model, "model": "none"}}], [{**entry, "estimated": ["k9"]}],
+        [{**entry, "model": {**model, "width": 320}}],
+    ]  # fmt: skip
+    for rivals in broken:
+        with pytest.raises(FormatError, match="damaged or unknown model"):
+            CameraMapping.from_calibration(camera(validity={"rivals": rivals}))
 
 
 def orientation(transform: dict[str, object] | None = None) -> FrameOrientation:

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from reseau.bundle import Network, adjust_network, regularised
+from reseau.bundle import Camera, Network, adjust_network, regularised
 from reseau.core.data import Array
 from reseau.core.errors import FormatError, UsageError
 from reseau.exchange.calibrations import mrcal
-from reseau.exchange.calibrations.plain import PlainCamera
+from reseau.exchange.calibrations.plain import given
 from reseau.io.network import Network1
 from reseau.optics import PixelGrid, camera_model
 from reseau.optics.cameras.splined import SplinedStereographic, SplineGrid
@@ -66,7 +66,7 @@ def test_projections_and_files_are_those_of_mrcal(grid: SplineGrid, tmp_path: Pa
     """mrcal reads the file that is written here, and projects the same to 1e-9 px, also beyond the knots."""
     values, x = values_of(grid), rays(65.0)
     names = camera_model(grid.name).names
-    camera = PlainCamera("wide", 1280, 960, grid.name, dict(zip(names, values.tolist(), strict=True)))
+    camera = Camera.of("wide", (1280, 960), grid.name, dict(zip(names, values.tolist(), strict=True)))
     path = tmp_path / "wide.cameramodel"
     path.write_text(mrcal.write(camera))
     code = (
@@ -91,17 +91,17 @@ def test_files_are_read_back_and_damaged_ones_refused(tmp_path: Path) -> None:
     grid = SplineGrid(3, 6, 5, 90)
     values, path = values_of(grid), tmp_path / "a.cameramodel"
     names = camera_model(grid.name).names
-    text = mrcal.write(PlainCamera("a", 1280, 960, grid.name, dict(zip(names, values.tolist(), strict=True))))
+    text = mrcal.write(Camera.of("a", (1280, 960), grid.name, dict(zip(names, values.tolist(), strict=True))))
     assert "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx=6_Ny=5_fov_x_deg=90" in text
     again = mrcal.read(text, path)
     assert again.model == grid.name
-    np.testing.assert_array_equal(again.of(*names), values)
+    np.testing.assert_array_equal(given(again, *names), values)
     with pytest.raises(FormatError, match="has 64 intrinsics, not the 74"):
         mrcal.read(text.replace("Nx=6", "Nx=7"), path)
     with pytest.raises(FormatError, match="needs an order of 2 or 3"):
         mrcal.read(text.replace("order=3", "order=5"), path)
     plain = mrcal.read(
-        mrcal.write(PlainCamera("a", 1280, 960, "stereographic", {"fx": 800.0, "fy": 800.0})), path
+        mrcal.write(Camera.of("a", (1280, 960), "stereographic", {"fx": 800.0, "fy": 800.0})), path
     )
     assert plain.model == "stereographic"
 

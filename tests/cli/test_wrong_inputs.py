@@ -263,11 +263,11 @@ calibrate TABLES --turntable angles-twice.csv
 calibrate TABLES --turntable angles-word.csv
     2 angles-word.csv, line 2: 'x' is not a number
 calibrate --rig left -d design.json
-    2 --rig: is 'left'; write name=files, each name once
+    2 --rig: cannot interpret 'left'; write name=files, each name once
 calibrate --rig left=tables -d design.json
     2 cameras of a rig: 1 is too few: at least two are required
 calibrate --rig left=tables --rig left=grey -d design.json
-    2 --rig: is 'left=grey'; write name=files, each name once
+    2 --rig: cannot interpret 'left=grey'; write name=files, each name once
 calibrate --rig left=zzz* --rig right=tables -d design.json
     2 zzz*: matches no file
 calibrate photo.png --rig left=tables --rig right=grey -d design.json
@@ -285,7 +285,7 @@ bundle network.json --datum free --control control-twice.csv
 bundle network.json --eliminate 1.5
     2 --eliminate: 1.5 is not between 0 and 1
 bundle network.json --camera-calibration lens.json
-    2 --camera-calibration: is 'lens.json'; write ID=calibration.json, each ID once
+    2 --camera-calibration: cannot interpret 'lens.json'; write ID=calibration.json, each ID once
 bundle datum.json
     2 datum.json: missing key `datum`
 bundle brace.json

@@ -82,7 +82,7 @@ def broken(change: str) -> str:
         ("unknown", "unknown key `lines.colour`"),
         ("missing", "missing key `pitch`"),
         ("twice", "duplicate id '1.01'"),
-        ("short", "`size` has 31 entries for 32 ids"),
+        ("short", "column `size` has 31 entries, the first 32"),
         ("shape", r"`targets.shape\[0\]`"),
         ("size", r"`targets.size\[0\]`.*greater than 0"),
         ("lines", "bound 1 × 1 squares, not 2 × 1"),

@@ -99,6 +99,7 @@ def test_a_camera_under_water_is_calibrated_without_and_with_the_water(
     assert abs(c.value - 8.0) < 4 * c.sigma
 
 
+@pytest.mark.slow
 def test_blurred_targets_are_measured_by_the_rays_of_their_lens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,6 +115,7 @@ def test_blurred_targets_are_measured_by_the_rays_of_their_lens(
     assert np.abs(errors).max() < 0.03
 
 
+@pytest.mark.slow
 def test_blurred_targets_are_measured_under_water(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("batoid", reason="batoid's rays draw the photographs")
     monkeypatch.chdir(tmp_path)

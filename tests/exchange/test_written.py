@@ -62,7 +62,7 @@ def test_a_camera_that_colmap_has_is_written_as_it_is_although_it_folds_beyond_t
     form, stored = calibration_formats()["colmap"], {"model": "opencv", "pitch_mm": (1.0, 1.0)}
     written = exported_lens(form, "camera", lens, stored)
     assert written.greatest_px == 0.0
-    assert {name: value for name, value in written.camera.values.items() if value} == given
+    assert {name: value for name, value in written.camera.parameters.items() if value} == given
 
 
 @pytest.mark.parametrize("kind", ["SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"])

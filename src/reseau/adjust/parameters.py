@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.data import Array, Mask
+from ..core.data import Array, Mask, twice
 from ..core.errors import UsageError
 
 
@@ -110,9 +110,8 @@ class Parameters:
                 f"{len(self.names)} names need as many finite values, not {self.values.shape}",
                 where="Parameters",
             )
-        if len(set(self.names)) != len(self.names):
-            twice = next(name for i, name in enumerate(self.names) if name in self.names[:i])
-            raise UsageError("occurs twice among the parameters", where=twice)
+        if (again := twice(self.names)) is not None:
+            raise UsageError("occurs twice among the parameters", where=again)
         wanted = set(self.names) if free is None else set(self._known(free))
         object.__setattr__(self, "free", tuple(name for name in self.names if name in wanted))
         if prior_sigma:

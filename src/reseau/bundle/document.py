@@ -11,6 +11,7 @@ from pydantic import ConfigDict, Field
 
 from ..core.data import Array
 from ..core.data import Rows as Indices
+from ..core.numbers import or_null
 from ..core.provenance import Provenance
 from ..io import Document, Strict
 from ..optics.poses import matrix_to_vector
@@ -289,6 +290,7 @@ class ResultDocument(Document):
     """
 
     SCHEMA: ClassVar[str] = "reseau-bundle/1"
+    LEFT_OUT: ClassVar[dict[str, Any]] = {"exclude_unset": True}
     sigma0: float | None
     observations: int
     unknowns: int
@@ -348,7 +350,7 @@ class ResultDocument(Document):
         if provenance is not None:
             more["provenance"] = provenance.to_dict()
         return cls(
-            sigma0=_number(result.sigma0),
+            sigma0=or_null(result.sigma0),
             observations=observations,
             unknowns=unknowns,
             constraints=constraints,
@@ -365,11 +367,6 @@ class ResultDocument(Document):
             **more,
             **_model_search(result),
         )  # fmt: skip
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content of the file; keys that do not apply are omitted."""
-        content = self.model_dump(mode="json", by_alias=True, exclude_unset=True)
-        return {"schema": self.SCHEMA} | content
 
 
 def model_search_entries(result: Result) -> dict[str, Any]:
@@ -411,7 +408,7 @@ def _camera(result: Result, c: int) -> CameraResult:
     camera, found = result.network.cameras[c], result.camera(c)
     held = {name: Estimate(value=value, sigma=0.0) for name, value in camera.parameters.items()}
     estimated = {
-        name: Estimate(value=value, sigma=_number(s))
+        name: Estimate(value=value, sigma=or_null(s))
         for name, value, s in zip(found.parameters, found.values.tolist(), found.sigma.tolist(), strict=True)
     }
     degrees = _column(found.dof) if found.dof is not None else (None,) * len(found.parameters)
@@ -586,15 +583,11 @@ def _plain(value: Any) -> Any:
         if value.ndim > 2:
             return tuple(map(_matrix, value))
         return _rows(value) if value.ndim == 2 else _column(value)
-    return _number(value) if isinstance(value, float) else value
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+    return or_null(value) if isinstance(value, float) else value
 
 
 def _column(values: Array) -> Column:
-    return tuple(_number(value) for value in values.tolist())
+    return tuple(or_null(value) for value in values.tolist())
 
 
 def _matrix(rows: Iterable[Array]) -> Matrix:

@@ -9,7 +9,7 @@ a rotation, the derivatives J by the parameters become (I − G(GᵀG)⁻¹Gᵀ)
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import numpy as np
@@ -63,6 +63,8 @@ class CameraMapping(CalibratedMapping):
         Left, top, right and bottom of the observations that it was estimated from, in pixels.
     dof : float
         Degrees of freedom of the covariance.
+    rivals : tuple of Rival
+        The camera by models of other kinds, which predict images about as well.
 
     Examples
     --------
@@ -86,6 +88,13 @@ class CameraMapping(CalibratedMapping):
     covariance: Array
     extent: tuple[float, ...] | None = None
     dof: float = float("inf")
+    rivals: tuple[Rival, ...] = ()
+
+    @property
+    def models(self) -> list[tuple[float, CameraMapping]]:
+        """The camera by each model, with its probability; the chosen one first."""
+        others = [(each.probability, each.lens) for each in self.rivals]
+        return [(1.0 - sum(p for p, _ in others), self), *others]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -144,23 +153,19 @@ class CameraMapping(CalibratedMapping):
         model = cast(dict[str, Any], calibration.model)
         extra: dict[str, Any] | None = model.get("additional")
         values = calibration.values()
+        rivals: list[dict[str, Any]] = calibration.validity.get("rivals", [])
         if (model.get("shutter") or {}).get("mode") == "line":
             raise FormatError("is that of a line camera: its images have no directions", where=where)
         if extra is not None and extra["per"] != "camera":
             raise FormatError("has several sets of additional parameters", where=where)
         try:
-            registered = camera_model(model["model"])
-            more = None
-            if extra is not None:
-                additional = additional_model(extra["model"])
-                more = additional.build(np.zeros(len(additional.names)), extra["base_mm"])
-            mapping = registered.mapping(
-                np.array([values.get(name, 0.0) for name in registered.names]),
-                PixelGrid(model["width"], model["height"], (model["pitch_mm"][0], model["pitch_mm"][1])),
-                options_of(model),
-                more,
-            )
-        except (UsageError, KeyError, IndexError) as error:
+            mapping = _mapping(model, values)
+            others = tuple(Rival.from_entry(each) for each in rivals)
+            if not 0 <= sum(each.probability for each in others) <= 1 + 1e-9:
+                raise ValueError("probabilities of models are none")
+            if any(each.lens.size != (model["width"], model["height"]) for each in others):
+                raise ValueError("models are of images of different sizes")
+        except (UsageError, KeyError, IndexError, TypeError, ValueError) as error:
             raise FormatError(f"has a damaged or unknown model: {error}", where=where) from None
         unknown = [name for name in values if name not in mapping.names]
         if unknown:
@@ -170,7 +175,7 @@ class CameraMapping(CalibratedMapping):
         size, extent = (model["width"], model["height"]), extent_of(calibration.validity)
         dof = calibration.validity.get("degrees_of_freedom")
         dof = float(dof) if isinstance(dof, int | float) and dof > 0 else float("inf")
-        return cls.of_estimates(mapping, size, values, names, matrix, extent, dof)
+        return cls.of_estimates(mapping, size, values, names, matrix, extent, dof, others)
 
     @classmethod
     def of_estimates(
@@ -182,14 +187,69 @@ class CameraMapping(CalibratedMapping):
         covariance: Array,
         extent: tuple[float, ...] | None = None,
         dof: float = float("inf"),
+        rivals: tuple[Rival, ...] = (),
     ) -> Self:
         """A camera with these values of its parameters, of which those named were estimated."""
         mapping = mapping.with_values({name: values[name] for name in mapping.names if name in values})
         rows = np.array([mapping.names.index(name) for name in names], dtype=np.intp)
-        return cls(mapping, *size, rows, covariance, extent, dof)
+        return cls(mapping, *size, rows, covariance, extent, dof, rivals)
 
 
 readable_as("camera")(CameraMapping.from_calibration)
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """A camera by a model of another kind than the chosen one.
+
+    Parameters
+    ----------
+    probability : float
+        Probability that it is the right model, by what each predicts of images that are left out.
+    lens : CameraMapping
+        The camera with this model.
+    model : mapping
+        The model as in a calibration.
+    """
+
+    probability: float
+    lens: CameraMapping
+    model: Mapping[str, Any] = field(default_factory=dict)
+
+    def entry(self) -> dict[str, Any]:
+        """What a calibration says of it."""
+        mapping = self.lens.mapping
+        return {
+            "probability": self.probability,
+            "model": dict(self.model),
+            "parameters": dict(zip(mapping.names, np.asarray(mapping.values).tolist(), strict=True)),
+            "estimated": list(self.lens.names),
+            "covariance": self.lens.covariance.tolist(),
+        }
+
+    @classmethod
+    def from_entry(cls, entry: Mapping[str, Any]) -> Self:
+        """Read what a calibration says of it."""
+        model, values = entry["model"], entry["parameters"]
+        lens = CameraMapping.of_estimates(
+            _mapping(model, values), (model["width"], model["height"]), values, tuple(entry["estimated"]),
+            np.array(entry["covariance"], dtype=np.float64).reshape(2 * (len(entry["estimated"]),)),
+        )  # fmt: skip
+        return cls(float(entry["probability"]), lens, model)
+
+
+def _mapping(model: Mapping[str, Any], values: Mapping[str, float]) -> PlaneMapping:
+    """The mapping of a model as in a calibration."""
+    registered, extra, more = camera_model(model["model"]), model.get("additional"), None
+    if extra is not None:
+        additional = additional_model(extra["model"])
+        more = additional.build(np.zeros(len(additional.names)), extra["base_mm"])
+    return registered.mapping(
+        registered.column(values),
+        PixelGrid(model["width"], model["height"], (model["pitch_mm"][0], model["pitch_mm"][1])),
+        options_of(model),
+        more,
+    )
 
 
 @dataclass(frozen=True, eq=False)

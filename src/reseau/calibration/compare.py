@@ -7,7 +7,8 @@ Two calibrations are compared after the rotation that brings the rays of one nea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,6 +54,10 @@ class FieldDifference(Display):
         Degrees of freedom of the covariances: their scale is an estimate.
     root : ndarray (rows * columns, 2, k), optional
         A root of the covariance of all differences together.
+    weight : float
+        Probability of the pair of models that are compared.
+    by_others : tuple of (float, FieldDifference)
+        Probabilities of other pairs of models, and the differences by them.
 
     Examples
     --------
@@ -72,6 +77,8 @@ class FieldDifference(Display):
     degrees: float
     dof: float = float("inf")
     root: Array | None = None
+    weight: float = 1.0
+    by_others: tuple[tuple[float, FieldDifference], ...] = ()
 
     @property
     def size(self) -> Array:
@@ -102,7 +109,16 @@ class FieldDifference(Display):
 
     @property
     def p(self) -> float:
-        """Probability of a difference at least as large when both are calibrations of the same camera."""
+        """Probability of a difference at least as large when both are calibrations of the same camera.
+
+        Where models of other kinds are possible, it is at least the mean over the pairs of models.
+        """
+        mean = self.weight * self.p_alone + sum(weight * each.p_alone for weight, each in self.by_others)
+        return max(self.p_alone, mean)
+
+    @property
+    def p_alone(self) -> float:
+        """The same by the models that were chosen."""
         return float(_tail(self.degrees, self.dof, np.array(self.statistic))) if self.degrees else 1.0
 
     @property
@@ -114,7 +130,8 @@ class FieldDifference(Display):
         d = self.difference[known]
         square = np.einsum("ni,ni->n", d, np.linalg.solve(self.cov[known], d[:, :, None])[:, :, 0])
         p[known] = _tail(2, self.dof, square)
-        return p
+        others = [weight * np.nan_to_num(each.p_at) for weight, each in self.by_others]
+        return np.maximum(p, self.weight * p + sum(others)) if others else p
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the differences, enlarged, over their standard deviation with matplotlib.
@@ -126,7 +143,7 @@ class FieldDifference(Display):
         axes : matplotlib Axes, optional
             Axes to draw into; by default those of a new figure.
         """
-        from ..core.figures import ACCENT, INK, draw_contours, image_axes, new_axes, nice
+        from ..core.figures import ACCENT, INK, draw_arrows, draw_contours, image_axes, new_axes, nice
 
         axes = new_axes(axes)
         if np.nanmax(self.sigma) > 0:
@@ -140,10 +157,7 @@ class FieldDifference(Display):
         enlarged = nice(pitch / typical) if typical > 0 else 1.0
         for sure, colour in ((False, INK), (True, ACCENT)):
             chosen = np.isfinite(size) & ((p < _SURE) == sure)
-            axes.quiver(
-                *xy[chosen].T, *(enlarged * d[chosen]).T, color=colour, angles="xy", scale_units="xy",
-                scale=1, width=0.003, zorder=4,
-            )  # fmt: skip
+            draw_arrows(axes, xy[chosen], enlarged * d[chosen], colour, 0.003, zorder=4)
         title = f"difference × {enlarged:g} over its σ / px; longest {np.nanmax(size):.2g} px"
         width, height = (self.xy[-1, -1] + 1).tolist()
         image_axes(axes, width, height, title)
@@ -173,6 +187,11 @@ def calibration_difference(
     variance. The parameters themselves are not compared: what many of them do together is known much better
     than each, and where they are hardly determined they are no linear functions of the image points.
 
+    A calibration whose model was chosen is one of several, with their probabilities. What they differ in is
+    a part of the covariance, as if it were normal; where it is not, the probability of the difference is its
+    mean over the pairs of models (Meng 1994, *Annals of Statistics* 22: posterior predictive p-values). The
+    larger one counts: where only the choice of the model differs, the cameras need not.
+
     Examples
     --------
     >>> from reseau.optics import OpenCV
@@ -182,6 +201,20 @@ def calibration_difference(
     >>> bool(abs(found.difference).max() < 1e-9), round(found.p, 3)
     (True, 1.0)
     """
+    pairs = [(p * q, one, two) for p, one in first.models for q, two in second.models]
+    by_others = []
+    for probability, one, two in pairs[1:]:
+        # Models without rays in common are not those of one camera.
+        with suppress(UsageError):
+            by_others.append((probability, _difference(one, two, across, down)))
+    found = _difference(first, second, across, down)
+    return replace(found, weight=pairs[0][0], by_others=tuple(by_others))
+
+
+def _difference(
+    first: CameraMapping, second: CameraMapping, across: int, down: int | None
+) -> FieldDifference:
+    """The difference by one model of each."""
     if (first.width, first.height) != (second.width, second.height):
         raise UsageError(
             f"{first.width}×{first.height} and {second.width}×{second.height} pixels cannot be compared",

@@ -9,7 +9,6 @@ crash, therefore finds the pictures that exist.
 from __future__ import annotations
 
 import asyncio
-import math
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -31,6 +30,7 @@ from ..core.errors import (
     StateError,
     UsageError,
 )
+from ..core.numbers import or_null
 from ..instruments import (
     Camera,
     CameraRig,
@@ -583,9 +583,9 @@ class Acquisition:
             facts: dict[str, Any] = {
                 "mm_per_px": None if scan.mm_per_px is None else list(scan.mm_per_px),
                 "origin_px": list(scan.origin_px),
-                "speed_m_s": _finite(scan.speed_m_s),
-                "frequency_khz": _finite(scan.frequency_khz),
-                "gain": _finite(scan.gain),
+                "speed_m_s": or_null(scan.speed_m_s),
+                "frequency_khz": or_null(scan.frequency_khz),
+                "gain": or_null(scan.gain),
                 **self._environment(),
             }
             clock = {"taken": scan.taken.isoformat()}
@@ -700,19 +700,14 @@ def _facts(camera: str, exposures: list[Exposure], before: dict[str, float], mov
     first = exposures[0]
     return {
         "camera": camera,
-        "exposure_us": _finite(first.exposure_us),
-        "gain": _finite(first.gain),
+        "exposure_us": or_null(first.exposure_us),
+        "gain": or_null(first.gain),
         "pattern": first.pattern,
         "position": before,
         "averaged": len(exposures),
         "moved": moved,
         "fresh": all(each.fresh for each in exposures),
     }
-
-
-def _finite(value: float) -> float | None:
-    """A value of an instrument; None if the instrument does not report it."""
-    return value if math.isfinite(value) else None
 
 
 def _clock(exposures: list[Exposure]) -> dict[str, Any]:

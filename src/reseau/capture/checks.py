@@ -12,6 +12,7 @@ import scipy
 
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
+from ..core.numbers import or_null
 
 _PIXEL = math.sqrt(1 / 12)
 _REACHES = (6, 12, 24)
@@ -88,7 +89,7 @@ class Readiness:
     def to_dict(self) -> dict[str, object]:
         """Return JSON values; None for a value that could not be determined."""
         found = {key: value for key, value in asdict(self).items() if key != "faults"}
-        return {k: v if math.isfinite(v) else None for k, v in found.items()} | {"faults": list(self.faults)}
+        return {k: or_null(v) for k, v in found.items()} | {"faults": list(self.faults)}
 
 
 def exposure_fault(frame: Frame, limits: Limits | None = None) -> str:

@@ -20,7 +20,7 @@ import typer
 from ..core import vocabulary as v
 from ..core.errors import UsageError
 from ..core.options import Group
-from .common import Place, remark_lines, say
+from .common import Place, remark_lines, say, say_notes
 
 if TYPE_CHECKING:
     from ..archive import Archive, Session
@@ -178,7 +178,7 @@ def _asked(where: Where, archive: Archive, bench: str, name: str, order: dict[st
     from ..service.orders import asked
     from ..service.recalibration import slept
 
-    typer.echo(f"note: reseau serve holds bench {bench} and carries out {name} in its turn", err=True)
+    say_notes([f"reseau serve holds bench {bench} and carries out {name} in its turn"])
     asked(archive, bench, "session", order, getpass.getuser(), name, slept)
     _conclude(where, archive.session(name), None)
 

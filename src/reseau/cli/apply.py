@@ -12,7 +12,7 @@ from ..core.errors import UsageError
 from ..core.files import made_folder, writable
 from ..core.options import Option
 from .calibrations import time_of
-from .common import Place, progress, say, say_files_left_out, say_json
+from .common import Place, progress, say, say_files_left_out, say_json, say_notes
 
 if TYPE_CHECKING:
     from ..calibration import Calibration
@@ -133,8 +133,7 @@ def apply(
     _only(stored.kind, "oscilloscope", {"--object-coordinates": object_coordinates})
     _only(stored.kind, "sensor", {"--exposure-ms": exposure_ms is not None})
     applied = Application.of(stored, view, object_system=object_coordinates, origin=origin, anyway=anyway)
-    for line in (*applied.notes, *(() if source is None or is_points(source) else applied.about(source))):
-        typer.echo(f"note: {line}", err=True)
+    say_notes((*applied.notes, *(() if source is None or is_points(source) else applied.about(source))))
     if out is not None and not (source is not None and source.is_dir()):
         beside = [out.with_suffix(".json")] if stored.kind == "camera" else []
         _spare([calibration, *([source] if source is not None else [])], [out, *beside])

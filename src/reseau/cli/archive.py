@@ -8,7 +8,7 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.files import writable
-from .common import Computing, Place, SessionName, progress, required, say, say_json
+from .common import Computing, Place, SessionName, progress, required, say, say_either, say_json
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -23,13 +23,12 @@ def list_(place: Place, as_json: v.AsJson = False) -> None:
     """List the sessions of an archive."""
     with place.open() as found:
         sessions = found.sessions()
-    if as_json:
-        rows = [vars(each) | {"begun": each.begun.isoformat()} for each in sessions]
-        say_json({"schema": "reseau-sessions/1", "sessions": rows})
-        return
-    for each in sessions:
-        counts = f"{each.frames:6d} frames {each.results:3d} results"
-        say(f"{each.begun:%Y-%m-%d %H:%M:%S}Z  {each.plan:<12} {counts}  {each.status:<10} {each.name}\n")
+    lines = (
+        f"{each.begun:%Y-%m-%d %H:%M:%S}Z  {each.plan:<12} {each.frames:6d} frames {each.results:3d} results"
+        f"  {each.status:<10} {each.name}"
+        for each in sessions
+    )
+    say_either(as_json, {"schema": "reseau-sessions/1", "sessions": list(map(vars, sessions))}, lines)
 
 
 @app.command()

@@ -15,7 +15,7 @@ from ..core.files import writable
 from ..core.options import Option
 from . import bench_by_hand as by_hand
 from .bench_by_hand import held_one
-from .common import say, say_json
+from .common import pairs_of, say, say_either, say_json
 from .declared import Commands
 
 
@@ -40,7 +40,7 @@ def features(
     """
     from ..instruments import Camera
 
-    wanted = dict(_pair(text) for text in set_ or [])
+    wanted = pairs_of(set_, "--set", "Name=value")
     with held_one(bench, Camera, camera, "reseau bench features") as found:
         if not hasattr(found, "user_sets"):
             raise UsageError("has no GenICam features", where=found.name)
@@ -71,27 +71,15 @@ def features(
         say(f"no feature with {search!r}\n")
 
 
-def _pair(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not equals or not name.isidentifier() or not value:
-        raise UsageError(f"cannot interpret {text!r}", where="--set", do="write Name=value")
-    return name, value
-
-
 def _compare(camera: Any, names: list[str], as_json: bool) -> None:
     """Print the features that differ between two user sets, or between one and the present values."""
     if len(names) > 2 or not all(names):
         raise UsageError("takes one or two user sets", where="--compare", do="write UserSet1,UserSet2")
     different = camera.compare_user_sets(*names)
     names = [*names, "present"][:2]
-    if as_json:
-        say_json({"schema": "reseau-user-sets/1", "sets": names, "different": different})
-        return
-    say(
-        "".join(f"{key}: {one} in {names[0]}, {two} in {names[1]}\n" for key, (one, two) in different.items())
-    )
-    if not different:
-        say(f"{names[0]} and {names[1]} do not differ\n")
+    lines = [f"{key}: {one} in {names[0]}, {two} in {names[1]}" for key, (one, two) in different.items()]
+    said = lines or [f"{names[0]} and {names[1]} do not differ"]
+    say_either(as_json, {"schema": "reseau-user-sets/1", "sets": names, "different": different}, said)
 
 
 app = Commands(help="Find, check, simulate, and use instruments by hand.")
@@ -185,12 +173,10 @@ def doctor(
 
     found = Bench.read(bench).diagnose(timeout_s)
     wrong = sum(each.fine is False for findings in found.values() for each in findings)
-    if as_json:
-        rows = {name: [vars(each) for each in findings] for name, findings in found.items()}
-        say_json({"schema": "reseau-bench-doctor/1", "wrong": wrong, "instruments": rows})
-    else:
-        marks = {True: "fine", None: "note", False: "wrong"}
-        say("".join(f"{name}: {marks[e.fine]}: {e}\n" for name, findings in found.items() for e in findings))
+    rows = {name: [vars(each) for each in findings] for name, findings in found.items()}
+    marks = {True: "fine", None: "note", False: "wrong"}
+    lines = (f"{name}: {marks[e.fine]}: {e}" for name, findings in found.items() for e in findings)
+    say_either(as_json, {"schema": "reseau-bench-doctor/1", "wrong": wrong, "instruments": rows}, lines)
     raise typer.Exit(1 if wrong else 0)
 
 

@@ -16,7 +16,7 @@ from ..core import vocabulary as v
 from ..core.errors import InputError, ReseauError, StateError, UsageError
 from ..core.files import writable
 from ..core.options import Option
-from .common import say, say_json
+from .common import pairs_of, say, say_json
 
 if TYPE_CHECKING:
     from ..capture import Bench
@@ -129,7 +129,11 @@ def move(
     from ..capture import by_hand
     from ..instruments import Turntable
 
-    wanted = dict(_number(text) for text in positions)
+    form = "axis=number, as tilt=30"
+    try:
+        wanted = {axis: float(text) for axis, text in pairs_of(positions, "positions", form).items()}
+    except ValueError as error:
+        raise UsageError(str(error), where="positions", do=f"write {form}") from None
     with held_one(bench, Turntable, table, "reseau bench move") as found:
         there = by_hand.targets(found, wanted, relative=relative)
         lost = [axis for axis in there if not found.state(axis).homed]
@@ -144,16 +148,6 @@ def _say_axes(table: Turntable) -> None:
     from ..capture import by_hand
 
     say("".join(f"{name:<12} {axis}\n" for name, axis in by_hand.axes_of(table).items()))
-
-
-def _number(text: str) -> tuple[str, float]:
-    name, equals, value = text.partition("=")
-    try:
-        if equals and name:
-            return name.strip(), float(value)
-    except ValueError:
-        pass
-    raise UsageError(f"cannot interpret {text!r}", where="positions", do="write axis=number, as tilt=30")
 
 
 def stop(bench: v.Bench = _BENCH) -> None:
@@ -305,16 +299,12 @@ _LIGHT = ("exposure_us", "gain")
 
 def _facts(frame: Any) -> dict[str, Any]:
     """Exposure and sharpness of a frame."""
-    import math
-
     from ..capture.checks import edge_sigma, exposure_fault, exposure_of
+    from ..core.numbers import or_null
 
     saturated, bright = exposure_of(frame)
-    edge = edge_sigma(frame)
-    return {
-        "saturated": saturated, "bright": bright, "edge_px": edge if math.isfinite(edge) else None,
-        "fault": exposure_fault(frame),
-    }  # fmt: skip
+    edge = or_null(edge_sigma(frame))
+    return {"saturated": saturated, "bright": bright, "edge_px": edge, "fault": exposure_fault(frame)}
 
 
 def _words(facts: dict[str, Any]) -> str:

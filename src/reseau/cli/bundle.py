@@ -20,7 +20,7 @@ from .bundle_options import (
     say_parameters,
     say_priors,
 )
-from .common import ended, progress, required, say
+from .common import ended, pairs_of, progress, required, say, say_notes
 
 if TYPE_CHECKING:
     from ..bundle import Network, Result
@@ -94,10 +94,10 @@ def bundle(
     writable(report, ".html")
     writable(convert, ".json")
     distance = positive(distance)
-    calibrations = _calibrations(camera_calibration or [])
+    given = pairs_of(camera_calibration, "--camera-calibration", "ID=calibration.json, each ID once")
+    calibrations = {name: Path(file) for name, file in given.items()}
     read = read_network(network, calibrations, control_sigma=control_sigma, sensor_width=sensor_width)
-    for line in read.notes:
-        typer.echo(f"note: {line}", err=True)
+    say_notes(read.notes)
     content = _with_settings(read, free, fix, control, datum, sigma_px)
     if convert is not None:
         network_document(content).write(convert)
@@ -140,10 +140,7 @@ def _export(result: Result, path: Path) -> None:
 
     for name, done in write_network(result, path).items():
         if done.greatest_px > 0:
-            typer.echo(
-                f"note: camera {name} as {done.camera.model} differs by {done.greatest_px:.2g} px at most",
-                err=True,
-            )
+            say_notes([f"camera {name} as {done.camera.model} differs by {done.greatest_px:.2g} px at most"])
 
 
 def _with_settings(
@@ -178,21 +175,6 @@ def _hashes(path: Path) -> dict[str, str]:
         files = [path, *calibration_files(path)]
         return {file.name: sha256_of(file) for file in files}
     return {f"{path.name}/{file.name}": sha256_of(file) for file in sorted(path.glob("*.txt"))}
-
-
-def _calibrations(texts: list[str]) -> dict[str, Path]:
-    """Calibration files by camera, from texts ``ID=file``."""
-    from ..core.errors import UsageError
-
-    found: dict[str, Path] = {}
-    for text in texts:
-        name, equals, file = text.partition("=")
-        if not equals or not name or not file or name in found:
-            raise UsageError(
-                f"is {text!r}", where="--camera-calibration", do="write ID=calibration.json, each ID once"
-            )
-        found[name] = Path(file)
-    return found
 
 
 def _say(path: Path, result: Result) -> None:

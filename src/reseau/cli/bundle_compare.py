@@ -58,12 +58,12 @@ def read_lens(path: Path) -> CameraMapping:
 
 def _document(first: Path, second: Path, found: FieldDifference) -> dict[str, Any]:
     """The difference in rows of the image; null where a camera images no ray."""
-    import numpy as np
-
+    from ..core.data import sigmas_of
+    from ..core.numbers import or_null
     from ..core.provenance import sha256_of
 
     def rows(values: Any) -> list[list[float | None]]:
-        return [[float(v) if np.isfinite(v) else None for v in row] for row in values]
+        return [[or_null(v) for v in row] for row in values]
 
     return {
         "schema": SCHEMA,
@@ -72,13 +72,12 @@ def _document(first: Path, second: Path, found: FieldDifference) -> dict[str, An
         "statistic": found.statistic,
         "degrees": found.degrees,
         "p": found.p,
+        "p_alone": found.p_alone,
         "rotation_rad": found.rotation.tolist(),
         "x": found.xy[0, :, 0].tolist(),
         "y": found.xy[:, 0, 1].tolist(),
         "dx": rows(found.difference[..., 0]),
         "dy": rows(found.difference[..., 1]),
-        "sx": rows(np.sqrt(found.cov[..., 0, 0])),
-        "sy": rows(np.sqrt(found.cov[..., 1, 1])),
-        "rho": rows(found.cov[..., 0, 1] / np.sqrt(found.cov[..., 0, 0] * found.cov[..., 1, 1])),
+        **dict(zip(("sx", "sy", "rho"), map(rows, sigmas_of(found.cov)), strict=True)),
         "p_at": rows(found.p_at),
     }

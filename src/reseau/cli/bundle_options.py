@@ -221,7 +221,9 @@ def say_difference(name: str, found: FieldDifference) -> None:
     size = np.sqrt(np.nanmean((found.difference**2).sum(axis=2)))
     known = np.isfinite(found.p_at)
     share = float((found.p_at[known] < 0.01).mean()) if known.any() else 0.0
-    test = f"χ² {found.statistic:.4g} with {found.degrees:.4g} degrees of freedom, p = {found.p:.2g}"
+    test = f"χ² {found.statistic:.4g} with {found.degrees:.4g} degrees of freedom, p = {found.p_alone:.2g}"
+    if found.by_others:
+        test += f"; with other models that are possible, {len(found.by_others) + 1} pairs, p = {found.p:.2g}"
     say(
         f"difference to {name}: {size:.2g} px rms, {test}\n"
         f"  significant at 1 % over {100 * share:.0f} % of the image\n"

@@ -30,11 +30,13 @@ from .common import (
     compile_first,
     ended,
     overlay_files,
+    pairs_of,
     progress,
     remark_lines,
     required,
     say,
     say_files_left_out,
+    say_notes,
 )
 
 if TYPE_CHECKING:
@@ -99,14 +101,8 @@ class _Camera(CameraChoice):
         from ..bundle.network.shutter import Shutter
         from ..procedures.calibration_options import CameraOptions
 
-        options: dict[str, str | float] = {} if self.side is None else {"side": self.side}
-        for text in self.model_option or ():
-            name, equals, value = text.partition("=")
-            if not equals or name in options:
-                raise UsageError(
-                    f"is {text!r}", where="--model-option", do="write name=value, each name once"
-                )
-            options[name] = value
+        given = [*([] if self.side is None else [f"side={self.side}"]), *(self.model_option or ())]
+        options = pairs_of(given, "--model-option", "name=value, each name once")
         if self.motion and self.rolling_shutter is None:
             raise UsageError("requires --rolling-shutter", where="--motion")
         shutter = None
@@ -114,7 +110,7 @@ class _Camera(CameraChoice):
             shutter = Shutter("rolling", self.rolling_shutter)
             shutter = replace(shutter, free=self.motion) if self.motion else shutter
         model = self.model or ("" if self.free or options else "auto")
-        return CameraOptions(model, self.free, self.pitch_mm, options, shutter)
+        return CameraOptions(model, self.free, self.pitch_mm, dict(options), shutter)
 
 
 @dataclass(frozen=True)
@@ -268,12 +264,11 @@ def calibrate(
             overlays={name: drawn[path] for name, path in photographs if path in drawn},
             executor=executor, store=computing.store,
             about={"sensor": sha256_of(reading.sensor) if reading.sensor else None},
-            note=_note, step=step,
+            note=lambda line: say_notes([line]), step=step,
         )  # fmt: skip
         sought = target is None and isinstance(found, Failure) and found.code is Code.NOT_FOUND
         done = required(found, "--design auto" if sought else _named(files))
-    for line in done.notes:
-        _note(line)
+    say_notes(done.notes)
     inputs = dict(photographs) | {
         path.name: path for path in (target and design, *adjustment.files, reading.sensor) if path
     }
@@ -305,10 +300,6 @@ def calibrate(
     ended(done.result.status)
 
 
-def _note(line: str) -> None:
-    typer.echo(f"note: {line}", err=True)
-
-
 def _named(files: list[Path]) -> str:
     """What a message about all photographs names: the only one, their folder, or nothing nearer."""
     folders = {path.parent for path in files}
@@ -327,13 +318,9 @@ def _photographs(images: list[Path], cameras: list[str]) -> tuple[list[tuple[str
         return [(path.name, path) for path in photographs_named(images)], {}
     if images:
         raise UsageError("cannot be combined with --rig", where=images[0])
-    files: dict[str, list[Path]] = {}
-    for text in cameras:
-        name, equals, pattern = text.partition("=")
-        if not equals or not name or not pattern or name in files:
-            raise UsageError(f"is {text!r}", where="--rig", do="write name=files, each name once")
-        files[name] = files_of(pattern)
-        say_files_left_out([Path(pattern)])
+    patterns = pairs_of(cameras, "--rig", "name=files, each name once")
+    files = {name: files_of(pattern) for name, pattern in patterns.items()}
+    say_files_left_out(map(Path, patterns.values()))
     found = exposures_of_files(files)
     photographs = [(name, path) for name, (path, _) in found.items()]
     return photographs, {name: at for name, (_, at) in found.items()}

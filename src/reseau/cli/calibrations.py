@@ -13,8 +13,9 @@ import typer
 from ..core import vocabulary as v
 from ..core.errors import EstimationError, UsageError
 from ..core.files import writable
+from ..core.numbers import or_null
 from ..core.options import Option
-from .common import Place, say, say_json
+from .common import Place, pairs_of, say, say_either, say_json
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -62,17 +63,10 @@ def define(
     place: Place,
 ) -> None:
     """Define a configuration of an instrument."""
-    parts = dict(_pair(each) for each in part)
+    parts = pairs_of(part, "--part", "KEY=VALUE")
     with _opened(place, create=True) as found:
         found.define(name, parts)
     say(f"{name}: {', '.join(f'{k} {v}' for k, v in parts.items())}\n")
-
-
-def _pair(text: str) -> tuple[str, str]:
-    key, equals, value = text.partition("=")
-    if not equals or not key or not value:
-        raise UsageError(f"{text!r} is not KEY=VALUE", where="option")
-    return key, value
 
 
 @app.command()
@@ -198,12 +192,13 @@ def show(
                 if out is not None:
                     applied.calibration.write(out)
             rows.append(row)
-    if as_json:
-        say_json({"schema": "reseau-in-force/1", "at": time.isoformat(), "configurations": rows})
-    else:
-        for row in rows:
-            since = "" if row["calibration"] is None else f" since {row['since'][:16]}Z, by {row['why']}"
-            say(f"{row['name']}: {row['calibration'] or 'no calibration in force'}{since}\n")
+    lines = (
+        f"{row['name']}: {row['calibration']} since {row['since'][:16]}Z, by {row['why']}"
+        if row["calibration"]
+        else f"{row['name']}: no calibration in force"
+        for row in rows
+    )
+    say_either(as_json, {"schema": "reseau-in-force/1", "at": time, "configurations": rows}, lines)
     if out is not None and rows[0]["calibration"] is None:
         raise EstimationError(f"no calibration applies at {time:%Y-%m-%d %H:%M}Z", where=name)
 
@@ -214,9 +209,8 @@ def history(name: Name, place: Place, as_json: v.AsJson = False) -> None:
     with _opened(place) as found:
         decisions, events = found.history(name), found.events(name)
     if as_json:
-        rows = [_row(each) for each in decisions]
-        said = [{"at": time.isoformat(), "what": what} for time, what in events]
-        say_json({"schema": "reseau-history/1", "decisions": rows, "events": said})
+        said = [{"at": time, "what": what} for time, what in events]
+        say_json({"schema": "reseau-history/1", "decisions": list(map(_row, decisions)), "events": said})
         return
     for each in decisions:
         say_decision(each, False)
@@ -226,13 +220,8 @@ def history(name: Name, place: Place, as_json: v.AsJson = False) -> None:
 
 def _row(made: Decision) -> dict[str, Any]:
     return vars(made) | {
-        "since": made.since.isoformat(),
-        "at": made.at.isoformat(),
         "judgement": made.judgement.to_dict(),
-        "comments": [list(each) for each in made.comments],
-        "earlier": [
-            {"by": by, "at": at.isoformat(), "judgement": judged.to_dict()} for by, at, judged in made.earlier
-        ],
+        "earlier": [{"by": by, "at": at, "judgement": judged.to_dict()} for by, at, judged in made.earlier],
     }
 
 
@@ -296,14 +285,14 @@ def drift(
     rows = [
         {
             "parameter": parameter, "learning": bool(charts.learning[last, k]),
-            "width": _number(charts.width[last, k]), "score": _number(charts.score[last, k]),
-            "autocorrelation": _number(charts.autocorrelation[last, k]),
+            "width": or_null(charts.width[last, k]), "score": or_null(charts.score[last, k]),
+            "autocorrelation": or_null(charts.autocorrelation[last, k]),
             "upper": float(charts.upper[last, k]), "lower": float(charts.lower[last, k]),
         }
         for k, parameter in enumerate(made.names)
     ]  # fmt: skip
     if as_json:
-        limits = vars(charts.limits) | {"limit": _number(charts.limits.limit)}
+        limits = vars(charts.limits) | {"limit": or_null(charts.limits.limit)}
         content = {
             "runs": last + 1,
             "conversion_px": made.conversion_px,
@@ -390,7 +379,7 @@ def at(
 
     writable(out, ".json")
     values, sigmas = {}, {}
-    for key, text in map(_pair, covariate):
+    for key, text in pairs_of(covariate, "--covariate", "KEY=VALUE").items():
         value, sign, sigma = text.replace("+-", "±").partition("±")
         try:
             values[key] = float(value)
@@ -401,9 +390,3 @@ def at(
     found = CalibrationFunction.read(source).at(sigmas, **values)
     found.write(out)
     say(f"{out}: {found.name} at {', '.join(f'{key} {value:g}' for key, value in values.items())}\n")
-
-
-def _number(value: float) -> float | None:
-    import math
-
-    return float(value) if math.isfinite(value) else None

@@ -16,7 +16,7 @@ from ..core.errors import UsageError
 from ..core.files import writable
 from ..core.options import Option
 from .calibrations import time_of
-from .common import Place, say, say_json
+from .common import Place, say, say_either, say_json
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -189,13 +189,10 @@ def verify(
         raise UsageError("needs the schema of PTB", where="verify", do="give --schema, or --without-schema")
     found = verified(file, schema=None if without_schema else schema, trusted=trust or ())
     refused = any(each.state == "failed" for each in found)
-    if as_json:
-        rows = [vars(each) | {"more": list(each.more)} for each in found]
-        say_json({"schema": "reseau-verification/1", "refused": refused, "checks": rows})
-    else:
-        for each in found:
-            say(f"{each.state:<12} {each.check:<11} {each.text}\n")
-        say(f"{file}: {'refused' if refused else 'nothing is wrong'}\n")
+    lines = [f"{each.state:<12} {each.check:<11} {each.text}" for each in found]
+    lines.append(f"{file}: {'refused' if refused else 'nothing is wrong'}")
+    content = {"refused": refused, "checks": list(map(vars, found))}
+    say_either(as_json, {"schema": "reseau-verification/1", **content}, lines)
     raise typer.Exit(1 if refused else 0)
 
 
@@ -285,25 +282,23 @@ def _document(
     budget: UncertaintyBudget, probability: float, missing: dict[str, str], simulated: Simulated | None
 ) -> dict[str, Any]:
     from ..adjust.uncertainty import validate
-
-    def finite(values: Any) -> list[float | None]:
-        return [float(v) if math.isfinite(v) else None for v in values]
+    from ..core.numbers import or_null
 
     found: dict[str, Any] = {
         "schema": "reseau-uncertainty/1",
         "probability": probability,
         "results": {
             "name": list(budget.names), "unit": list(budget.units), "value": budget.values.tolist(),
-            "sigma": budget.sigma.tolist(), "degrees": finite(budget.degrees),
+            "sigma": budget.sigma.tolist(), "degrees": [or_null(v) for v in budget.degrees],
             "factor": budget.factor(probability).tolist(), "expanded": budget.expanded(probability).tolist(),
         },
         "covariance": budget.covariance.tolist(),
-        "joint": {"degrees": finite([budget.joint_degrees])[0],
-                  "factor": finite([budget.joint_factor(probability)])[0]},
+        "joint": {"degrees": or_null(budget.joint_degrees),
+                  "factor": or_null(budget.joint_factor(probability))},
         "inputs": list(budget.inputs),
         "sensitivities": budget.sensitivities.tolist(),
         "contributions": [
-            {"name": each.name, "degrees": finite([each.degrees])[0], "distribution": each.distribution,
+            {"name": each.name, "degrees": or_null(each.degrees), "distribution": each.distribution,
              "group": each.group, "sigma": u.tolist()}
             for each, u in zip(budget.contributions, budget.by_contribution, strict=True)
         ],

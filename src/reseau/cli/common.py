@@ -104,8 +104,7 @@ class Reading:
         from ..io.images import read_image
 
         frame = read_image(path, self.channel)
-        for note in frame.notes:
-            typer.echo(f"note: {note}", err=True)
+        say_notes(frame.notes)
         return frame if self.correction is None else self.correction.correct(frame)
 
     @cached_property
@@ -233,6 +232,37 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
+def say_either(as_json: bool, value: object, lines: Iterable[str]) -> None:
+    """Write a value as JSON, or lines of text, to standard output."""
+    if as_json:
+        say_json(value)
+    else:
+        say("".join(f"{line}\n" for line in lines))
+
+
+def say_notes(notes: Iterable[object]) -> None:
+    """Write notes to standard error, a line for each."""
+    for note in notes:
+        typer.echo(f"note: {note}", err=True)
+
+
+def pairs_of(texts: Iterable[str] | None, option: str, form: str) -> dict[str, str]:
+    """Values by name of texts NAME=VALUE, each name once; `form` says in messages what to write.
+
+    Examples
+    --------
+    >>> pairs_of(["tilt=30", "roll=-10"], "positions", "axis=number")
+    {'tilt': '30', 'roll': '-10'}
+    """
+    found: dict[str, str] = {}
+    for text in texts or ():
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not name or not value or name in found:
+            raise UsageError(f"cannot interpret {text!r}", where=option, do=f"write {form}")
+        found[name] = value
+    return found
+
+
 def say_json(value: object) -> None:
     """Write a value as JSON to standard output."""
     from ..core.provenance import canonical_json
@@ -245,9 +275,8 @@ def say_files_left_out(paths: Iterable[Path]) -> None:
     from ..procedures.exposures import files_left_out
 
     for path in paths:
-        line = files_left_out(path) if path.is_dir() else ""
-        if line:
-            typer.echo(f"note: {line}", err=True)
+        if path.is_dir() and (line := files_left_out(path)):
+            say_notes([line])
 
 
 def compile_first(job: str, jobs: int | None = None) -> None:

@@ -12,7 +12,7 @@ import typer
 from ..core import vocabulary as v
 from ..core.files import writable
 from ..core.options import Option
-from .common import say
+from .common import say, say_notes
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -269,7 +269,7 @@ def board(
 
         design = of(_filling(of, printed.paper) if pitch is None else pitch, size)
     if asked := unusual_size(design):
-        typer.echo(f"note: {asked}: give --pitch and --size in mm", err=True)
+        say_notes([f"{asked}: give --pitch and --size in mm"])
     what = f"{design.kind}, {design.columns} × {design.rows}, pitch {design.pitch:g} mm"
     _write(design, printed, what)
 

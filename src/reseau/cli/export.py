@@ -11,7 +11,7 @@ from ..core import vocabulary as v
 from ..core.errors import UsageError
 from ..core.files import writable
 from ..core.options import Option
-from .common import say
+from .common import say, say_notes
 
 _SAME, _FAR = 1e-5, 0.3
 """Differences (px) that are rounding errors, and above which another format is proposed."""
@@ -83,10 +83,9 @@ def _calibration(files: list[Path], to: str | None, out: Path | None, anyway: bo
         say(f"{out}: {calibrations[0].model.get('model', calibrations[0].kind)}\n")
         return
     written = export_calibrations(calibrations, to, out, anyway=anyway)
-    for line in written[0].notes:
-        typer.echo(f"note: {line}", err=True)
+    say_notes(written[0].notes)
     for done in written:
-        name = f" {done.camera.name}" if len(written) > 1 else ""
+        name = f" {done.camera.id}" if len(written) > 1 else ""
         say(f"{out}:{name} {to}, model {done.camera.model}\n")
         if done.greatest_px > _SAME:
             rms, most = plain(done.rms_px, 2), plain(done.greatest_px, 2)

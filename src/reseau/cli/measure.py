@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -18,7 +18,7 @@ from .declared import Commands
 if TYPE_CHECKING:
     from ..core.data import Frame
     from ..core.failure import Failure
-    from ..io import ReseauMeasurement
+    from ..io import Document, ReseauMeasurement
     from ..measure.points import Measured
 
 
@@ -27,6 +27,7 @@ NOT_NOMINAL = "Not used with nominal positions."
 _NAMED = 8
 """Marks that are printed of those that were not measured for one reason."""
 
+D = TypeVar("D", bound="Document")
 app = Commands(help="Measure image coordinates of a target.")
 
 Image = Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")]
@@ -39,6 +40,20 @@ class Output:
     out: v.Out | None = None
     overlay: v.Overlay | None = None
     as_json: v.AsJson = False
+
+    def drawn(self, image: Path) -> Path | None:
+        """Return the overlay of the image, if one is wanted; names of files are checked."""
+        writable(self.out, ".json", ".csv")
+        return None if self.overlay is None else overlay_files(self.overlay, [image])[image]
+
+    def deliver(self, document: D, csv: Callable[[D], str], text: Callable[[D], str]) -> None:
+        """Write a document to its file, and print it as JSON or as text."""
+        from ..io import write_whole
+
+        if self.out is not None:
+            as_csv = self.out.suffix.lower() == ".csv"
+            write_whole(self.out, csv(document) if as_csv else document.to_json())
+        say(document.to_json() if self.as_json else text(document))
 
 
 @app.callback()
@@ -182,16 +197,8 @@ class Task:
     def __init__(
         self, image: Path, output: Output, marks: str, spread: str = "leave-one-out deviations"
     ) -> None:
-        out, overlay = output.out, output.overlay
-        self.image, self.out, self.as_json, self.marks, self.spread = (
-            image,
-            out,
-            output.as_json,
-            marks,
-            spread,
-        )
-        self.suffix = ".json" if out is None else writable(out, ".json", ".csv").suffix.lower()
-        self.overlay = overlay_files(overlay, [image])[image] if overlay is not None else None
+        self.image, self.output, self.marks, self.spread = image, output, marks, spread
+        self.overlay = output.drawn(image)
 
     def run(self, reading: Reading, measure: Callable[[Frame], Any]) -> None:
         """Measure the image and deliver the result."""
@@ -210,33 +217,24 @@ class Task:
 
     def _deliver(self, document: ReseauMeasurement, result: Measured | None) -> None:
         """Write the measurement to its file, and report what was measured."""
+        self.output.deliver(
+            document,
+            lambda found: found.image_points().to_csv(".6f"),
+            lambda found: self._text(found, result),
+        )
+
+    def _text(self, document: ReseauMeasurement, result: Measured | None) -> str:
         from ..core.numbers import measured
-        from ..io import write_whole
         from ..procedures.target_measurement import by_reason, few_of
 
-        if self.out is not None:
-            write_whole(self.out, measurement_csv(document) if self.suffix == ".csv" else document.to_json())
-        if self.as_json:
-            say(document.to_json())
-            return
-        say(f"{self.image.name}: {document.found} of {document.expected} {self.marks} measured\n")
+        lines = [f"{self.image.name}: {document.found} of {document.expected} {self.marks} measured"]
         if result is not None:
             rms = result.rms()
             if rms[0] == rms[0]:  # NaN if too few points were measured
-                say(f"{self.spread} {rms[0]:.2g} px in x, {rms[1]:.2g} px in y (rms)\n")
+                lines.append(f"{self.spread} {rms[0]:.2g} px in x, {rms[1]:.2g} px in y (rms)")
         for why, names in by_reason({each.id: each.why for each in document.points if not each.ok}).items():
-            say(f"  {few_of(names, _NAMED)}: {why}\n")
+            lines.append(f"  {few_of(names, _NAMED)}: {why}")
         for point in document.points:
             if point.share is not None and point.s_share is not None:
-                say(f"  {point.id}: cut at {measured(point.share, point.s_share)} of its segment\n")
-        for note in document.notes:
-            say(f"note: {note}\n")
-
-
-def measurement_csv(found: ReseauMeasurement) -> str:
-    """Measured marks as CSV ``id,x,y,sx,sy``."""
-    points = found.image_points()
-    lines = ["id,x,y,sx,sy"]
-    for name, (x, y), (sx, sy) in zip(points.names, points.xy, points.sigma, strict=True):
-        lines.append(f"{name},{x:.6f},{y:.6f},{sx:.3e},{sy:.3e}")
-    return "\n".join(lines) + "\n"
+                lines.append(f"  {point.id}: cut at {measured(point.share, point.s_share)} of its segment")
+        return "\n".join([*lines, *(f"note: {note}" for note in document.notes)]) + "\n"

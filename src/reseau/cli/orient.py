@@ -9,7 +9,6 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import InputError
-from ..core.files import writable
 from ..core.options import Group, Option
 from .common import Computing, overlay_files, progress, required, say, say_files_left_out, say_json
 from .measure import Output
@@ -156,14 +155,12 @@ def fiducials(
     from ..core.failure import Failure
     from ..core.provenance import sha256_of
     from ..designs import aerial_camera
-    from ..io import FiducialDesign, write_whole
+    from ..io import FiducialDesign
     from ..io.images import open_scan, read_image
     from ..measure.fiducials import measure_fiducials
     from ..measure.fiducials.measure import FiducialOptions
 
-    out, overlay = output.out, output.overlay
-    suffix = ".json" if out is None else writable(out, ".json", ".csv").suffix.lower()
-    drawn = None if overlay is None else overlay_files(overlay, [scan])[scan]
+    drawn = output.drawn(scan)
     named = design.parent == Path() and not design.suffix and not design.exists()
     camera = aerial_camera(design.name) if named else FiducialDesign.read(design)
     options = FiducialOptions(dpi, None if rotation is None else int(rotation), mirrored, transform)
@@ -176,27 +173,17 @@ def fiducials(
         assert not isinstance(found, Failure)
         pixels = opened.window(0, opened.height, 0, opened.width)
         found.overlay(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels, drawn)
-    result = required(found, scan)
-    document = result.document()
-    if out is not None:
-        write_whole(out, document.to_json() if suffix == ".json" else csv_of(document))
-    if output.as_json:
-        say(document.to_json())
-        return
-    _say_marks(document)
+    output.deliver(required(found, scan).document(), csv_of, _marks)
 
 
 def csv_of(document: FiducialOrientation) -> str:
     """Measured marks as CSV ``id,x,y,sx,sy,rho``."""
-    lines = ["id,x,y,sx,sy,rho"]
-    for mark in document.marks:
-        if mark.at is not None:
-            c = mark.at
-            lines.append(f"{mark.id},{c.x:.4f},{c.y:.4f},{c.sx:.4f},{c.sy:.4f},{c.rho:.4f}")
-    return "\n".join(lines) + "\n"
+    from ..io.frame import points_of
+
+    return points_of({m.id: m.at for m in document.marks if m.at is not None}).to_csv(".4f", ".4f", ".4f")
 
 
-def _say_marks(document: FiducialOrientation) -> None:
+def _marks(document: FiducialOrientation) -> str:
     """Describe the orientation: one line for the scan, one for each mark, and notes."""
     from ..core.numbers import measured
 
@@ -204,27 +191,26 @@ def _say_marks(document: FiducialOrientation) -> None:
     assert document.px_per_mm is not None
     good = sum(mark.ok for mark in document.marks)
     side = "mirrored, " if document.mirrored else ""
-    say(
+    lines = [
         f"{document.image}: {good} of {len(document.marks)} fiducial marks, {side}rotated by "
-        f"{document.rotation_deg}°, {25.4 * document.px_per_mm:.1f} dpi\n"
-    )
+        f"{document.rotation_deg}°, {25.4 * document.px_per_mm:.1f} dpi"
+    ]
     sigma, kind = document.transform.sigma_mm, document.transform.kind
     if sigma is None:
-        say(f"{kind}: no residuals\n")
+        lines.append(f"{kind}: no residuals")
     else:
-        say(f"{kind}: residuals {1000 * sigma[0]:.2g} µm in X, {1000 * sigma[1]:.2g} µm in Y\n")
+        lines.append(f"{kind}: residuals {1000 * sigma[0]:.2g} µm in X, {1000 * sigma[1]:.2g} µm in Y")
     for mark in document.marks:
         if mark.at is None:
-            say(f"  {mark.id}: {mark.why}\n")
+            lines.append(f"  {mark.id}: {mark.why}")
             continue
         x, y = document.transform.residuals_mm[mark.id]
         c = mark.at
-        say(
+        lines.append(
             f"  {mark.id}: x {measured(c.x, c.sx, 'px')}, y {measured(c.y, c.sy, 'px')}, residuals "
-            f"{1000 * x:.1f}, {1000 * y:.1f} µm\n"
+            f"{1000 * x:.1f}, {1000 * y:.1f} µm"
         )
-    for note in document.notes:
-        say(f"note: {note}\n")
+    return "\n".join([*lines, *(f"note: {note}" for note in document.notes)]) + "\n"
 
 
 Box = tuple[float, float, float, float]

@@ -12,7 +12,7 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
-from .common import compile_first, progress, say, say_json
+from .common import compile_first, progress, say, say_json, say_notes
 
 if TYPE_CHECKING:
     from ..io.document import Document
@@ -95,8 +95,8 @@ def schema(
     """Print the format of a document as JSON Schema (draft 2020-12), or list all."""
     missing = set[str]()
     known = documents(missing)
-    for why in sorted(missing) if name not in known else ():
-        typer.echo(f"note: documents are left out: {why}", err=True)
+    if name not in known:
+        say_notes(f"documents are left out: {why}" for why in sorted(missing))
     if name is None:
         for each, kind in known.items():
             about = (kind.__doc__ or "").strip().splitlines()[0]

@@ -14,7 +14,7 @@ from ..core import vocabulary as v
 from ..core.errors import UsageError
 from ..core.files import made_folder, writable
 from ..core.options import Option
-from .common import CameraChoice, say
+from .common import CameraChoice, say, say_either, say_json
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -42,13 +42,6 @@ class Service:
         return Client(self.server, None, self.authority)
 
 
-def _shown(value: Any, as_json: bool, lines: list[str]) -> None:
-    if as_json:
-        say(json.dumps(value, indent=1, ensure_ascii=False) + "\n")
-    else:
-        say("".join(f"{line}\n" for line in lines))
-
-
 @app.command()
 def sessions(
     service: Service,
@@ -64,7 +57,7 @@ def sessions(
     lines = [
         f"{s['begun'][:16]}Z  {s['name']}  {s['plan']}  {s['frames']} frames  {s['status']}" for s in found
     ]
-    _shown(found, as_json, lines)
+    say_either(as_json, found, lines)
 
 
 @app.command()
@@ -86,7 +79,7 @@ def show(
     lines.append(f"{found['good']} good frames" + (f" of {found['expected']}" if found["expected"] else ""))
     lines += [f"rejected {each['step']}: {each['why']}" for each in found["rejected"]]
     lines += [f"result {each['name']}" for each in found["results"]]
-    _shown(found, as_json, lines)
+    say_either(as_json, found, lines)
 
 
 @app.command()
@@ -99,7 +92,7 @@ def calibrations(service: Service, as_json: v.AsJson = False) -> None:
         force = each["in_force"]
         since = f"in force since {force['since'][:16]}Z" if force else "no calibration in force"
         lines.append(f"{each['name']}: {since}, {each['to_review']} to review")
-    _shown(found, as_json, lines)
+    say_either(as_json, found, lines)
 
 
 @app.command()
@@ -107,7 +100,7 @@ def alarms(service: Service, as_json: v.AsJson = False) -> None:
     """List the open alarms; exit status 1 if there are any."""
     with service.client() as client:
         found = client.get("/alarms")
-    _shown(found, as_json, [each["text"] for each in found])
+    say_either(as_json, found, [each["text"] for each in found])
     raise typer.Exit(1 if found else 0)
 
 
@@ -121,7 +114,7 @@ def benches(service: Service, as_json: v.AsJson = False) -> None:
         session = each["session"]
         about = f", session {session['name']}: {session['state']}, {session['good']} good" if session else ""
         lines.append(f"{each['name']}: {each['state']} {each['error'] or each['moving']}".rstrip() + about)
-    _shown(found, as_json, lines)
+    say_either(as_json, found, lines)
 
 
 @app.command()
@@ -239,4 +232,4 @@ def call(
     elif out is not None:
         writable(out).write_text(json.dumps(found, indent=1))
     else:
-        say(json.dumps(found, indent=1, ensure_ascii=False) + "\n")
+        say_json(found)

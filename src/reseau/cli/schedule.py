@@ -17,7 +17,7 @@ from ..core.errors import ReseauError, UsageError
 from ..core.files import writable
 from ..core.options import Option
 from .calibrations import say_decision, time_of
-from .common import Place, for_systemd, say, say_json
+from .common import Place, for_systemd, say, say_either, say_notes
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def list_(place: Place) -> None:
         for name in schedules.names():
             say(f"{name}\n")
             for run in schedules.runs(name)[-2:]:
-                say(f"  {_row(run)}")
+                say(f"  {_row(run)}\n")
 
 
 @app.command()
@@ -80,18 +80,13 @@ def show(
 
     with place.open() as found:
         runs = Schedules(found).runs(name, time_of(at, "--at"), ahead)
-    if as_json:
-        rows = [vars(each) | {"time": each.time.isoformat()} for each in runs]
-        say_json({"schema": "reseau-runs/1", "runs": rows})
-    else:
-        for run in runs:
-            say(_row(run))
+    say_either(as_json, {"schema": "reseau-runs/1", "runs": list(map(vars, runs))}, map(_row, runs))
     past = [each.state for each in runs if each.state != "scheduled"]
     raise typer.Exit(1 if past and past[-1] in ("overdue", "failed", "blocked") else 0)
 
 
 def _row(run: Run) -> str:
-    return f"{run.time:%Y-%m-%d %H:%M}Z  {run.state:<10} {run.why}\n"
+    return f"{run.time:%Y-%m-%d %H:%M}Z  {run.state:<10} {run.why}"
 
 
 @app.command()
@@ -230,7 +225,7 @@ def recalibrate(
         if resume and unfinished is None:
             raise UsageError("has no session that can be continued", where=name)
         if not resume and unfinished is not None:
-            typer.echo(f"note: {unfinished} is not done; --resume continues it", err=True)
+            say_notes([f"{unfinished} is not done; --resume continues it"])
         decision = known.ask(name, unfinished or "" if resume else "", getpass.getuser())
     say_decision(decision, as_json)
     raise typer.Exit(0 if decision.outcome.startswith("accepted") else 1)
@@ -247,13 +242,12 @@ def list_alarms(
 
     with place.open() as found:
         known = Alarms(found).all() if everything else Alarms(found).open()
-    if as_json:
-        rows = [vars(each) | {"sent": [at.isoformat() for at in each.sent]} for each in known]
-        say_json({"schema": "reseau-alarms/1", "alarms": rows})
-    else:
-        for each in known:
-            by = f", acknowledged by {each.acknowledged}" if each.acknowledged else ""
-            say(f"{each.text}; sent {len(each.sent)} times{by}\n  {each.key}\n")
+    lines = (
+        f"{each.text}; sent {len(each.sent)} times"
+        f"{f', acknowledged by {each.acknowledged}' if each.acknowledged else ''}\n  {each.key}"
+        for each in known
+    )
+    say_either(as_json, {"schema": "reseau-alarms/1", "alarms": list(map(vars, known))}, lines)
     raise typer.Exit(1 if any(not each.acknowledged for each in known) else 0)
 
 

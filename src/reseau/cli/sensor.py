@@ -12,7 +12,7 @@ from ..core import vocabulary as v
 from ..core.errors import EstimationError, UsageError
 from ..core.files import writable
 from ..core.options import Option
-from .common import Reading, overlay_files, probability, progress, required, say
+from .common import Reading, probability, progress, required, say, say_notes
 from .measure import Output
 
 if TYPE_CHECKING:
@@ -60,8 +60,7 @@ def sensor(
     procedure = SensorProcedure(name=called, region=region, options=options)
     with progress("reading", len(given)) as step:
         notes = add_files(procedure, given, channel=channel, root=root, step=step)
-    for note in notes:
-        typer.echo(f"note: {note}", err=True)
+    say_notes(notes)
     found = procedure.calibration(called)
     if out is not None:
         write_whole(out, found.to_json())
@@ -154,23 +153,18 @@ def edge(
     from ..report.edges import edges_overlay, edges_report
 
     regions = region or []
-    out, overlay = output.out, output.overlay
-    suffix = ".json" if out is None else writable(out, ".json", ".csv").suffix.lower()
+    picture = output.drawn(image)
     writable(report)
-    picture = overlay_files(overlay, [image])[image] if overlay is not None else None
     frame = reading.frame(image)
     options = {"regions": regions or None, "channel": reading.channel}
     with progress(f"measuring {image.name}", max(1, len(regions))) as step:
         result = measure_sharpness(frame, regions, options=options, step=step)
     found = required(result, image)
-    document = found.document()
     if picture is not None:
         edges_overlay(found, picture)
     if report is not None:
         write_whole(report, edges_report(found, title=f"Sharpness of {image.name}"))
-    if out is not None:
-        write_whole(out, _csv(document) if suffix == ".csv" else document.to_json())
-    say(document.to_json() if output.as_json else _lines(document))
+    output.deliver(found.document(), _csv, _lines)
 
 
 def _lines(document: EdgesDocument) -> str:

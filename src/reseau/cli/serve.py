@@ -13,7 +13,7 @@ from ..core import vocabulary as v
 from ..core.errors import UsageError
 from ..core.files import writable
 from ..core.options import Option
-from .common import Place, for_systemd, say, say_json
+from .common import Place, for_systemd, say, say_either
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -233,12 +233,8 @@ def list_users(
     """List the users."""
     with known.open() as found:
         users = found.users()
-    if as_json:
-        rows = [vars(each) | {"created": each.created.isoformat()} for each in users]
-        say_json({"schema": "reseau-users/1", "users": rows})
-        return
-    for each in users:
-        say(f"{each.name}: {each.scope}{', one-time password' if each.one_time else ''}\n")
+    lines = (f"{each.name}: {each.scope}{', one-time password' if each.one_time else ''}" for each in users)
+    say_either(as_json, {"schema": "reseau-users/1", "users": list(map(vars, users))}, lines)
 
 
 @user_app.command("change")
@@ -404,10 +400,9 @@ def verify(
         else:
             wrong = verify_log(found, read_text(public_key).encode(), heads)
         count = len(found.journal("audit").entries())
-    if as_json:
-        say_json({"schema": "reseau-audit-verification/1", "entries": count, "wrong": wrong})
-    else:
-        say("".join(f"{each}\n" for each in wrong) or f"{count} entries: nothing is wrong\n")
+    content = {"entries": count, "wrong": wrong}
+    said = wrong or [f"{count} entries: nothing is wrong"]
+    say_either(as_json, {"schema": "reseau-audit-verification/1", **content}, map(str, said))
     raise typer.Exit(1 if wrong else 0)
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -116,6 +116,52 @@ class Frame(Display):
         return int(self.pixels.shape[0])
 
 
+H = TypeVar("H", bound=Hashable)
+
+
+def twice(names: Iterable[H]) -> H | None:
+    """The first name that occurs a second time; None without one.
+
+    Examples
+    --------
+    >>> twice(["a", "b", "a"])
+    'a'
+    """
+    seen: set[H] = set()
+    for name in names:
+        if name in seen:
+            return name
+        seen.add(name)
+    return None
+
+
+def covariances_of(sx: ArrayLike, sy: ArrayLike, rho: ArrayLike = 0.0) -> Array:
+    """Covariance matrices (n, 2, 2) of standard deviations and correlations (n,).
+
+    Examples
+    --------
+    >>> covariances_of([2.0], [3.0], [0.5])
+    array([[[4., 3.],
+            [3., 9.]]])
+    """
+    x, y, r = np.broadcast_arrays(*(np.asarray(each, dtype=np.float64) for each in (sx, sy, rho)))
+    both = r * x * y
+    return np.stack([x * x, both, both, y * y], axis=-1).reshape(*x.shape, 2, 2)
+
+
+def sigmas_of(cov: Array) -> tuple[Array, Array, Array]:
+    """Standard deviations in x and y, and correlations (n,), of covariance matrices (n, 2, 2).
+
+    Examples
+    --------
+    >>> [float(each[0]) for each in sigmas_of(np.array([[[4.0, 3.0], [3.0, 9.0]]]))]
+    [2.0, 3.0, 0.5]
+    """
+    sx, sy = np.sqrt(cov[..., 0, 0]), np.sqrt(cov[..., 1, 1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return sx, sy, cov[..., 0, 1] / (sx * sy)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ImagePoints(Display):
     """Named points in a plane with their covariances, in columns.
@@ -181,11 +227,8 @@ class ImagePoints(Display):
         ]
 
     def _columns(self) -> dict[str, list[Any]]:
-        s = self.sigma
-        with np.errstate(invalid="ignore", divide="ignore"):
-            rho = self.cov[:, 0, 1] / (s[:, 0] * s[:, 1])
-        columns = {"x": self.xy[:, 0], "y": self.xy[:, 1], "sx": s[:, 0], "sy": s[:, 1], "rho": rho}
-        return {"id": list(self.names)} | {name: column.tolist() for name, column in columns.items()}
+        columns = np.column_stack([self.xy, *sigmas_of(self.cov)]).T.tolist()
+        return {"id": list(self.names)} | dict(zip(("x", "y", "sx", "sy", "rho"), columns, strict=True))
 
     def plot(self, axes: Axes | None = None, *, y_down: bool = True) -> Axes:
         """Draw the points with their standard ellipses, enlarged, with matplotlib.
@@ -216,11 +259,13 @@ class ImagePoints(Display):
         """
         write_whole(Path(path), self.to_csv())
 
-    def to_csv(self) -> str:
-        """The points as lines ``id,x,y,sx,sy``."""
-        lines = ["id,x,y,sx,sy"]
-        for name, (x, y), (sx, sy) in zip(self.names, self.xy, self.sigma, strict=True):
-            lines.append(f"{name},{x:.7f},{y:.7f},{sx:.3e},{sy:.3e}")
+    def to_csv(self, xy: str = ".7f", sigma: str = ".3e", rho: str = "") -> str:
+        """The points as lines ``id,x,y,sx,sy``, also with ``rho`` where there is a format for it."""
+        forms = {"x": xy, "y": xy, "sx": sigma, "sy": sigma} | ({"rho": rho} if rho else {})
+        values = np.column_stack([self.xy, self.sigma, np.nan_to_num(sigmas_of(self.cov)[2])]).tolist()
+        lines = [",".join(("id", *forms))]
+        for name, row in zip(self.names, values, strict=True):
+            lines.append(",".join((name, *map(format, row, forms.values()))))
         return "\n".join(lines) + "\n"
 
     def select(self, keep: Sequence[str] | Mask) -> ImagePoints:

@@ -127,7 +127,7 @@ def length(value: float, unit: str) -> str:
 
 
 def draw_ellipses(
-    axes: Axes, at: Array, cov: Array, colour: str = ACCENT, enlarged: float | None = None
+    axes: Axes, at: Array, cov: Array, colour: str = ACCENT, enlarged: float | None = None, **style: Any
 ) -> float:
     """Draw standard ellipses of points, enlarged.
 
@@ -143,6 +143,8 @@ def draw_ellipses(
         Of the lines.
     enlarged : float, optional
         Factor of enlargement; by default a round one that makes them 4 % of the axes' width in the median.
+    **style
+        Of the collection, in place of its own.
 
     Returns
     -------
@@ -165,9 +167,17 @@ def draw_ellipses(
         offsets=at,
         offset_transform=axes.transData,
     )
-    ellipses.set(facecolor="none", edgecolor=colour, linewidth=0.6)
+    ellipses.set(**{"facecolor": "none", "edgecolor": colour, "linewidth": 0.6, **style})
     axes.add_collection(ellipses)
     return enlarged
+
+
+def draw_arrows(
+    axes: Axes, at: Array, vectors: Array, colour: str, width: float = 0.004, **style: Any
+) -> None:
+    """Draw vectors (n, 2) as arrows from points (n, 2), in the scale of the axes."""
+    form = {"color": colour, "width": width, **style}
+    axes.quiver(*at.T, *vectors.T, angles="xy", scale_units="xy", scale=1, **form)
 
 
 def plane_axes(axes: Axes, panel: Panel, title: str) -> None:
@@ -229,19 +239,8 @@ def _vectors(axes: Axes, marks: Pair, check: Pair, reach: float, panel: Panel) -
         if not len(at):
             continue
         axes.plot(*at.T, ".", color=FAINT, markersize=1.6, zorder=1)
-        axes.quiver(
-            *at.T,
-            *(vectors * scale).T,
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            width=0.0032,
-            headwidth=3.2,
-            headlength=4.2,
-            headaxislength=3.8,
-            color=colour,
-            zorder=2,
-        )
+        head = {"headwidth": 3.2, "headlength": 4.2, "headaxislength": 3.8}
+        draw_arrows(axes, at, vectors * scale, colour, 0.0032, zorder=2, **head)
     _scale_arrow(axes, scale, nice(typical), panel.unit)
 
 
@@ -296,6 +295,15 @@ def image_axes(axes: Axes, width: float, height: float, title: str = "") -> None
     axes.set_xlabel("x / px")
     axes.set_ylabel("y / px")
     axes.set_title(title, loc="left")
+
+
+def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
+    """Set title and labels, and hide the upper and right spines."""
+    axes.set_title(title, loc="left")
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
 
 
 def over_picture(axes: Axes | None, pixels: NDArray[Any] | None = None, *, y_down: bool = True) -> Axes:

@@ -23,6 +23,17 @@ def aligned(values: Iterable[float], decimals: int) -> list[str]:
     return ["–" if v is None else f"{v:.{decimals}f}".replace("-", _MINUS) for v in rounded]
 
 
+def or_null(value: float) -> float | None:
+    """A number as JSON has it: None in place of NaN and infinity.
+
+    Examples
+    --------
+    >>> or_null(0.5), or_null(float("nan"))
+    (0.5, None)
+    """
+    return float(value) if np.isfinite(value) else None
+
+
 def grouped(value: float) -> str:
     """One decimal below a thousand, whole and in groups of three above.
 

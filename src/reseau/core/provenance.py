@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -32,14 +33,14 @@ def sha256_of(source: bytes | Path) -> str:
 
 
 def canonical_json(value: Any) -> str:
-    """Render JSON with reproducible bytes, with a newline at its end.
+    """Render JSON with reproducible bytes, with a newline at its end; times by ISO 8601.
 
     Examples
     --------
     >>> canonical_json({"sigma": 0.5})
     '{\\n "sigma": 0.5\\n}\\n'
     """
-    return json.dumps(value, ensure_ascii=False, allow_nan=False, indent=1) + "\n"
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, indent=1, default=datetime.isoformat) + "\n"
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..bundle import Camera, Network, Result
 from ..bundle.diagnostics.fields import camera_mapping
-from ..core.data import Array, Rows
+from ..core.data import Array
 from ..core.errors import FormatError, UsageError
 from ..io import read_text, write_whole
 from ..optics.poses import matrix_to_vector, rotation_matrix
@@ -68,7 +68,7 @@ def read_bal(path: Path | str) -> Network:
         poses[:, 3:6],
         poses[:, 6:],
         values[4 * observations + 9 * cameras :].reshape(-1, 3),
-        (image, point, table[:, 2:]),
+        table,
         tuple(str(i) for i in range(cameras)),
     )
 
@@ -106,8 +106,8 @@ def write_bal(result: Result, path: Path | str) -> None:
     network, fit = result.network, result.fit
     if network.refraction is not None or network.parallel.any():
         raise UsageError("cannot be written as BAL", where="network with windows or parallel rays")
-    used = fit.usable.observations & ~result.rejected
-    rows = np.flatnonzero(used & fit.usable.points[network.point_of] & fit.usable.images[network.image_of])
+    part = fit.usable
+    rows = np.flatnonzero(result.used & part.points[network.point_of] & part.images[network.image_of])
     image, point = (np.unique(of[rows], return_inverse=True) for of in (network.image_of, network.point_of))
     turns = fit.values.rotation
     xy, interior = np.full((len(rows), 2), np.nan), np.zeros((len(image[0]), 3))
@@ -156,7 +156,7 @@ def centred_network(
     shifts: Array,
     interior: Array,
     xyz: Array,
-    seen: tuple[Rows, Rows, Array],
+    seen: Array,
     images: tuple[str, ...],
     files: tuple[str | None, ...] | None = None,
 ) -> Network:
@@ -169,12 +169,11 @@ def centred_network(
     interior : ndarray (m, 3)
         f, k1, k2 of each image, which has a camera of its own.
     xyz : ndarray (p, 3)
-    seen : tuple
-        Rows of images and of points (n,), coordinates (n, 2).
+    seen : ndarray (n, 4)
+        Row of the image, row of the point, x, y.
     """
-    image, point, table = seen
-    half = int(np.ceil(np.abs(table).max()))
-    xy = np.column_stack([table[:, 0] + half, half - table[:, 1]])
+    half = int(np.ceil(np.abs(seen[:, 2:]).max()))
+    seen = np.column_stack([seen[:, :2], seen[:, 2] + half, half - seen[:, 3]])
     return network_of(
         tuple(_camera(str(i), 2 * half + 1, *row) for i, row in enumerate(interior)),
         images,
@@ -183,11 +182,11 @@ def centred_network(
         -np.einsum("mji,mj->mi", matrices, shifts),
         tuple(str(j) for j in range(len(xyz))),
         xyz,
-        (image, point, xy, np.ones(xy.shape)),
+        seen,
         files=files,
     )
 
 
 def _camera(name: str, size: int, f: float, k1: float, k2: float) -> Camera:
-    values = np.array([f, 0.0, 0.0, k1 / f**2, k2 / f**4, 0.0, 0.0, 0.0, 0.0, 0.0])
-    return Camera(name, size, size, (1.0, 1.0), "brown", values, ("c", "K1", "K2"))
+    values = {"c": f, "K1": k1 / f**2, "K2": k2 / f**4}
+    return Camera.of(name, (size, size), "brown", values, tuple(values))

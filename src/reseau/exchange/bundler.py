@@ -96,7 +96,7 @@ def read_bundler(path: Path | str) -> Network:
         poses[used, 12:],
         poses[used, :3],
         np.array(xyz),
-        (row[image[keep]], point_of[keep], every[keep, 2:]),
+        np.column_stack([row[image[keep]], every[keep, 1:]]),
         names,
         names if named else None,
     )

@@ -24,6 +24,7 @@ from .prescribed import (
     finite,
     glasses_beside,
     kind_behind,
+    scale_of,
     schott,
     with_stop,
     within,
@@ -137,16 +138,7 @@ def _lens(commands: list[tuple[str, list[str]]], stem: str, own: Mapping[str, Me
     if len(listed) < 3:
         raise FormatError("is not a lens of CODE V: it has no surfaces between SO and SI")
     notes: list[str] = []
-    unit, scale = "", 1.0
-    if "DIM" in stated:
-        word = stated["DIM"][0].upper() if stated["DIM"] else ""
-        if word not in _UNITS:
-            raise FormatError(f"has the unit {word!r}, which is not known", do="expected M, C or I")
-        unit, scale = _UNITS[word]
-        if scale != 1:
-            notes.append(f"is in {unit}; lengths are converted to mm")
-    else:
-        notes.append("states no unit; lengths are taken as mm")
+    scale = scale_of(stated.get("DIM"), _UNITS, notes)
     if "TEM" in stated and _numbers("TEM", stated["TEM"])[0] != 20:
         notes.append(f"is meant for {stated['TEM'][0]} °C; indices are those at 20 °C")
     if any(any(_numbers(key, stated[key])) for key in _VIGNETTING if key in stated):

@@ -6,14 +6,12 @@ pixel is subtracted. Poses are quaternions (scalar first) and translations, x_c 
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from ..bundle import Camera, Network, Result
 from ..bundle.diagnostics.fields import camera_mapping
@@ -21,26 +19,13 @@ from ..core.data import Array
 from ..core.errors import FormatError, UsageError
 from ..core.files import made_folder
 from ..io import read_text, write_whole
-from ..optics import camera_model
-from ..optics.poses import matrix_to_vector
 from .calibrations import calibration_formats
+from .calibrations.colmap import MODELS
 from .calibrations.formats import Exported, exported_lens
-from .lines import network_of, numbers, read_bytes
+from .lines import Binary, network_of, numbers
 
-# Parameters of each model, in COLMAP's order.
-_MODELS = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
-    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
-}
 # Their numbers in binary files; 7 has another projection (FOV).
-_NUMBERS = dict(zip((*range(7), 8, 9), _MODELS, strict=True))
+_NUMBERS = dict(zip((*range(7), 8, 9), MODELS, strict=True))
 
 
 def read_colmap(folder: Path | str) -> Network:
@@ -79,7 +64,7 @@ def read_colmap(folder: Path | str) -> Network:
     if not images or not points:
         raise FormatError("contains no images or no points", where=folder)
     rows, order = {name: j for j, name in enumerate(points)}, {name: c for c, name in enumerate(cameras)}
-    image_of, point_of, xy, twice = list[int](), list[int](), list[Array](), 0
+    seen, twice = list[tuple[float, ...]](), 0
     for i, image in enumerate(images):
         known = set[str]()
         for at, name in zip(image.xy, image.points, strict=True):
@@ -91,22 +76,20 @@ def read_colmap(folder: Path | str) -> Network:
                 twice += 1
             else:
                 known.add(name)
-                image_of.append(i)
-                point_of.append(rows[name])
-                xy.append(at)
-    if not xy:
+                seen.append((i, rows[name], at[0] - 0.5, at[1] - 0.5))
+    if not seen:
         raise FormatError("contains no observations of points", where=folder)
     table, names = np.array([image.pose for image in images]), tuple(image.name for image in images)
-    matrices, pixels = _rotations(table[:, :4]), np.array(xy) - 0.5
+    turns = scipy.spatial.transform.Rotation.from_quat(table[:, [1, 2, 3, 0]])
     return network_of(
         tuple(cameras.values()),
         names,
         np.array([order[image.camera] for image in images], dtype=np.intp),
-        matrix_to_vector(matrices),
-        -np.einsum("mji,mj->mi", matrices, table[:, 4:]),
+        turns.as_rotvec(),
+        -turns.apply(table[:, 4:], inverse=True),
         tuple(points),
         np.array(list(points.values())),
-        (np.array(image_of, np.intp), np.array(point_of, np.intp), pixels, np.ones(pixels.shape)),
+        seen,
         files=names,
         notes=(f"{folder}: {twice} second observations of a point in the same image left out",)
         if twice
@@ -160,8 +143,7 @@ def write_colmap(result: Result, folder: Path | str) -> dict[str, Exported]:
         line = form.write(written[camera.id].camera).splitlines()[-1]
         cameras.append(f"{c + 1} {line.split(maxsplit=1)[1]}")
     turns = fit.values.rotation
-    used = fit.usable.observations & ~result.rejected
-    seen = used & fit.usable.points[network.point_of] & fit.usable.images[network.image_of]
+    seen = result.used & fit.usable.points[network.point_of] & fit.usable.images[network.image_of]
     lines, place = list[str](), np.full(len(network.xy), -1)
     for i in np.flatnonzero(fit.usable.images):
         rows = network.rays_of_images[i]
@@ -214,10 +196,10 @@ def _text(folder: Path) -> _Content:
     cameras: dict[str, Camera] = {}
     path = folder / "cameras.txt"
     for number, words in _lines(path):
-        if len(words) < 4 or words[1] not in _MODELS:
-            known = ", ".join(_MODELS)
+        if len(words) < 4 or words[1] not in MODELS:
+            known = ", ".join(MODELS)
             raise FormatError(f"line {number}: not a camera of a known model: {known}", where=path)
-        width, height, *values = numbers(words[2:], 2 + len(_MODELS[words[1]]), path, number)
+        width, height, *values = numbers(words[2:], 2 + len(MODELS[words[1]]), path, number)
         cameras[words[0]] = _camera(words[0], words[1], (int(width), int(height)), values)
     points: dict[str, Sequence[float]] = {}
     path = folder / "points3D.txt"
@@ -240,27 +222,27 @@ def _text(folder: Path) -> _Content:
 
 def _binary(folder: Path) -> _Content:
     """Cameras and points by name, and images, of binary files."""
-    file = _Binary(folder / "cameras.bin")
+    file = Binary(folder / "cameras.bin")
     cameras: dict[str, Camera] = {}
-    for _ in range(file.count):
+    for _ in range(file.count()):
         number, kind, width, height = file.take("<iiQQ")
         model = _NUMBERS.get(kind)
         if model is None:
-            known = ", ".join(_MODELS)
+            known = ", ".join(MODELS)
             raise FormatError(
                 f"camera {number} has the model number {kind}; known are {known}", where=file.path
             )
-        values = file.take(f"<{len(_MODELS[model])}d")
+        values = file.take(f"<{len(MODELS[model])}d")
         cameras[str(number)] = _camera(str(number), model, (width, height), values)
-    file = _Binary(folder / "points3D.bin")
+    file = Binary(folder / "points3D.bin")
     points: dict[str, Sequence[float]] = {}
-    for _ in range(file.count):
+    for _ in range(file.count()):
         number, *xyz = file.take("<Q3d")
         points[str(number)] = xyz
         (length,) = file.take("<3xdQ")[1:]
         file.skip(8 * length)
-    file, images = _Binary(folder / "images.bin"), []
-    for _ in range(file.count):
+    file, images = Binary(folder / "images.bin"), []
+    for _ in range(file.count()):
         _, *pose, camera = file.take("<i7di")
         name = file.text()
         (length,) = file.take("<Q")
@@ -269,41 +251,6 @@ def _binary(folder: Path) -> _Content:
             raise FormatError(f"image {name} has a camera that is not in cameras.bin", where=file.path)
         images.append(_Image(name, str(camera), pose, table["xy"], [str(p) for p in table["point"].tolist()]))
     return cameras, points, images
-
-
-class _Binary:
-    """A binary file, read from its beginning; `count` is its number of entries."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self._content, self._at = path, read_bytes(path, 1000), 0
-        (self.count,) = self.take("<Q")
-
-    def _next(self, size: int) -> int:
-        start, self._at = self._at, self._at + size
-        if self._at > len(self._content):
-            raise FormatError("ends too early", where=self.path, do="write it again")
-        return start
-
-    def skip(self, size: int) -> None:
-        """Leave out bytes."""
-        self._next(size)
-
-    def take(self, form: str) -> tuple[Any, ...]:
-        """Values in the form of :mod:`struct`."""
-        return struct.unpack_from(form, self._content, self._next(struct.calcsize(form)))
-
-    def table(self, length: int, kind: np.dtype[Any]) -> NDArray[Any]:
-        """Rows of a structured array."""
-        start = self._next(length * kind.itemsize)
-        return np.frombuffer(self._content, kind, length, start)
-
-    def text(self) -> str:
-        """Text up to a zero byte."""
-        end = self._content.find(b"\0", self._at)
-        if end < 0:
-            raise FormatError("ends within a name", where=self.path, do="write it again")
-        start = self._next(end + 1 - self._at)
-        return self._content[start:end].decode("utf-8", "replace")
 
 
 def _lines(path: Path, *, every: bool = False) -> Iterator[tuple[int, list[str]]]:
@@ -315,34 +262,14 @@ def _lines(path: Path, *, every: bool = False) -> Iterator[tuple[int, list[str]]
 
 
 def _camera(name: str, model: str, size: tuple[int, int], values: Sequence[float]) -> Camera:
-    names, (width, height) = _MODELS[model], size
-    given = dict(zip(names, values, strict=True))
-    for key in ("cx", "cy"):
-        given[key] -= 0.5
-    wide = model.endswith("FISHEYE")
-    if wide and "f" in given:
-        given["fx"] = given["fy"] = given["f"]
-    elif "f" in given:
-        f = given["f"]
+    given = dict(zip(MODELS[model], values, strict=True))
+    cx, cy = given["cx"] - 0.5, given["cy"] - 0.5
+    kind = "fisheye" if model.endswith("FISHEYE") else "opencv"
+    f = given.get("f", 0.0)
+    if "f" in given and kind == "opencv":
         # One principal distance for both axes: Brown's model with a pitch of one.
-        brown = [f, given["cx"] - (width - 1) / 2, (height - 1) / 2 - given["cy"]]
-        radial = [given.get("k1", 0.0) / f**2, given.get("k2", 0.0) / f**4]
-        free = ("c", *(f"K{k}" for k in (1, 2) if f"k{k}" in given))
-        all_values = np.array([*brown, *radial, *5 * [0.0]])
-        return Camera(name, *size, (1.0, 1.0), "brown", all_values, free)
-    kind = "fisheye" if wide else "opencv"
-    full = camera_model(kind)
-    parameters = np.array([given.get(key, 0.0) for key in full.names])
-    free = tuple(key for key in full.of_role("scale", "distortion") if key in given)
-    return Camera(name, *size, (1.0, 1.0), kind, parameters, free)
-
-
-def _rotations(quaternions: Array) -> Array:
-    """Rotation matrices (m, 3, 3) of quaternions (m, 4), scalar first."""
-    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+        brown = {"c": f, "x0": cx - (size[0] - 1) / 2, "y0": (size[1] - 1) / 2 - cy}
+        radial = {f"K{k}": given[f"k{k}"] / f ** (2 * k) for k in (1, 2) if f"k{k}" in given}
+        return Camera.of(name, size, "brown", brown | radial, ("c", *radial))
+    given = {"fx": f, "fy": f} | given | {"cx": cx, "cy": cy}
+    return Camera.of(name, size, kind, given, given.keys() - {"cx", "cy"})

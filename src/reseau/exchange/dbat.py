@@ -20,7 +20,7 @@ from ..core.data import Array
 from ..core.errors import FormatError
 from ..io import read_text
 from ..optics.poses import angles_to_matrix, matrix_to_vector
-from .lines import network_of
+from .lines import Control, network_of
 from .markup import Node, read_markup
 
 _OPENING = re.compile(rb"<document\b[^>]*\bdbat_script_version")
@@ -103,51 +103,34 @@ def read_dbat(path: Path | str) -> Network:
     known = {name: i for i, name in enumerate(ids)}
     if len(known) < len(ids):
         raise FormatError("has an image twice", where=images.where)
-    rows, seen = list[tuple[int, str, list[float]]](), set[tuple[str, str]]()
+    seen, order = dict[tuple[str, str], list[float]](), dict[str, int]()
     for image, point, *values in (row for table in marks for row in table):
         if image not in known:
             raise FormatError(f"has a mark in image {image}, which is not in the list", where=path)
-        if (image, point) not in seen:
-            seen.add((image, point))
-            rows.append((known[image], point, values))
-    control = {
-        "control": _control(given.find("ctrl_pts"), base),
-        "check": _control(given.find("check_pts"), base),
-    }
-    twice = control["control"].keys() & control["check"].keys()
+        row = order.setdefault(point, len(order))
+        seen.setdefault((image, point), [known[image], row, values[0] - 0.5, values[1] - 0.5, *values[2:]])
+    control, check = (_control(given.find(f"{kind}_pts"), base) for kind in ("ctrl", "check"))
+    twice = control.keys() & check.keys()
     if twice:
         raise FormatError(f"has the point {min(twice)} as control and as check point", where=path)
-    points = list(dict.fromkeys(row[1] for row in rows))
-    order = {name: j for j, name in enumerate(points)}
     x0, turns = _poses(given.find("prior_eo/file"), base, known)
     chosen = list(dict.fromkeys(which))
-    table = np.array([row[2] for row in rows], dtype=np.float64)
     network = network_of(
         tuple(cameras[name] for name in chosen),
         tuple(labels),
         np.array([chosen.index(name) for name in which], dtype=np.intp),
         turns,
         x0,
-        tuple(points),
-        np.full((len(points), 3), np.nan),
-        (
-            np.array([row[0] for row in rows], dtype=np.intp),
-            np.array([order[row[1]] for row in rows], dtype=np.intp),
-            table[:, :2] - 0.5,
-            table[:, 2:],
-        ),
+        tuple(order),
+        np.full((len(order), 3), np.nan),
+        list(seen.values()),
+        # Check points are compared with their coordinates, which are no observations.
+        control={name: Control(xyz, sigma, "control") for name, (xyz, sigma) in control.items()}
+        | {name: Control(xyz, np.full(3, np.nan), "check") for name, (xyz, _) in check.items()},
         files=tuple(files),
         unit=_unit(root),
     )
-    xyz, sigma, role = network.xyz.copy(), network.sigma.copy(), list(network.role)
-    for kind, found in control.items():
-        for name, (at, accuracy) in found.items():
-            if name in order:
-                # A check point is compared with its coordinates, which are no observations.
-                observed = accuracy if kind == "control" else np.full(3, np.nan)
-                xyz[order[name]], sigma[order[name]], role[order[name]] = at, observed, kind
-    network = replace(network, xyz=xyz, sigma=sigma, role=tuple(role))
-    return replace(network, datum="control") if role.count("control") >= 3 else network
+    return replace(network, datum="control") if network.role.count("control") >= 3 else network
 
 
 def _last(file: str) -> str:

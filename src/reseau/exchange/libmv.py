@@ -10,17 +10,17 @@ pixel, ours at its centre: half a pixel is subtracted.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..bundle import Camera, Network
 from ..core.errors import FormatError
-from ..optics import camera_model
+from ..core.files import head_of
 from ..optics.poses import matrix_to_vector
-from .lines import network_of, read_bytes
+from .lines import Binary, network_of
 
-_MOST_MB = 1000
 _CAMERA = [("image", "i4"), ("turn", "f4", (3, 3)), ("shift", "f4", 3)]
 _POINT = [("track", "i4"), ("xyz", "f4", 3)]
 _MARKER = [("image", "i4"), ("track", "i4"), ("xy", "f4", 2)]
@@ -75,42 +75,32 @@ def read_libmv(path: Path | str) -> Network:
     (('7',), ('3',), array([[-0., -0., -5.]]), array([[319.5, 239.5]]))
     """
     path = Path(path)
-    content = read_bytes(path, _MOST_MB)
-    if not is_libmv(content):
+    head = head_of(path)
+    if not is_libmv(head):
         raise FormatError("is not a problem of libmv", where=path)
-    if content[1:2] == b"N":
+    if head[1:2] == b"N":
         raise FormatError(
             "has markers without the camera, in normalised coordinates",
             where=path,
             do="write markers in image space",
         )
-    order, at = "<" if content[:1] == b"v" else ">", 2
+    order: Literal["<", ">"] = "<" if head[:1] == b"v" else ">"
+    file = Binary(path, begin=2)
 
-    def table(kind: list[tuple[str, str]] | list[tuple[str, str, object]], count: int) -> NDArray[np.void]:
-        nonlocal at
-        form = np.dtype([(name, order + code, *shape) for name, code, *shape in kind])
-        if count < 0 or at + count * form.itemsize > len(content):
-            raise FormatError("ends too early", where=path, do="write it again")
-        found = np.frombuffer(content, form, count, at)
-        at += count * form.itemsize
+    def table(kind: list[Any], count: int | None = None) -> NDArray[Any]:
+        form = np.dtype(kind).newbyteorder(order)
+        found = file.table(file.count(f"{order}i") if count is None else count, form)
         if not all(np.isfinite(found[name]).all() for name in form.names or ()):
             raise FormatError("contains numbers that are not finite", where=path)
         return found
 
-    def count() -> int:
-        return int(table([("n", "i4")], 1)["n"][0])
-
     focal, *rest = table([("value", "f4")], 8)["value"].astype(np.float64).tolist()
-    cameras = table(_CAMERA, count())  # type: ignore[arg-type]
-    points = table(_POINT, count())  # type: ignore[arg-type]
-    markers = table(_MARKER, count())  # type: ignore[arg-type]
-    if at != len(content):
-        raise FormatError(f"has {len(content) - at} bytes after the last marker", where=path)
-    for what, numbers in (("image", cameras["image"]), ("track", points["track"])):
+    cameras, points, markers = (table(kind) for kind in (_CAMERA, _POINT, _MARKER))
+    if file.left:
+        raise FormatError(f"has {file.left} bytes after the last marker", where=path)
+    for what, numbers in (("an image", cameras["image"]), ("a track", points["track"])):
         if len(np.unique(numbers)) != len(numbers):
-            raise FormatError(
-                f"has an {what} twice" if what == "image" else f"has a {what} twice", where=path
-            )
+            raise FormatError(f"has {what} twice", where=path)
     if not focal > 0:
         raise FormatError(f"has the focal length {focal:g}", where=path)
     # Markers of images or tracks that were not reconstructed are not used, as in Ceres' example.
@@ -128,9 +118,7 @@ def read_libmv(path: Path | str) -> Network:
     )
     # From the corner of the top-left pixel to its centre.
     xy, named["cx"], named["cy"] = xy - 0.5, named["cx"] - 0.5, named["cy"] - 0.5
-    model = camera_model("opencv")
-    values = np.array([named.get(key, 0.0) for key in model.names])
-    camera = Camera("camera", width, height, (1.0, 1.0), "opencv", values, ("fx", "fy", "k1", "k2"))
+    camera = Camera.of("camera", (width, height), "opencv", named, ("fx", "fy", "k1", "k2"))
     turns = cameras["turn"].astype(np.float64).transpose(0, 2, 1)
     return network_of(
         (camera,),
@@ -140,7 +128,7 @@ def read_libmv(path: Path | str) -> Network:
         -np.einsum("mji,mj->mi", turns, cameras["shift"].astype(np.float64)),
         tuple(str(j) for j in tracks.tolist()),
         points["xyz"].astype(np.float64),
-        (_rows(images, markers["image"]), _rows(tracks, markers["track"]), xy, np.ones(xy.shape)),
+        np.column_stack([_rows(images, markers["image"]), _rows(tracks, markers["track"]), xy]),
     )
 
 

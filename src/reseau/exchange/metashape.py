@@ -20,7 +20,7 @@ import io
 import re
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 from ..bundle import Camera, Network
 from ..core.data import Array
 from ..core.errors import FormatError
-from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
-from .lines import network_of, read_bytes
+from .lines import Control, network_of, read_bytes
 from .markup import Node, read_markup
 
 _RADIAL = ("k1", "k2", "k3", "k4")
@@ -143,14 +142,8 @@ class _Image:
     file: str
 
 
-@dataclass
-class _Seen:
-    """Image points, by key of the image."""
-
-    image: list[str] = field(default_factory=list)
-    point: list[str] = field(default_factory=list)
-    xy: list[Array] = field(default_factory=list)
-    sigma: list[float] = field(default_factory=list)
+_Seen = list[tuple[str, str, float, float, float]]
+"""Image points: key of the image, name of the point, x, y and their standard deviation."""
 
 
 @dataclass
@@ -175,18 +168,19 @@ class _Chunk:
         seen, tie = self.markers(images, accuracy["accuracy_projections"]), dict[str, Array]()
         if self.part is not None:
             tie = self.ties(images, seen, accuracy["accuracy_tiepoints"])
-        if not seen.image:
+        if not seen:
             raise FormatError(
                 "contains no image points of markers in aligned images",
                 where=self.path,
                 do="export markers as XML (File > Export > Export Markers), or save the project as .psz",
             )
-        missing = [key for key in seen.image if images[key].sensor not in cameras]
+        shown = {key for key, *_ in seen}
+        used = [key for key in images if key in shown]
+        missing = [key for key in used if images[key].sensor not in cameras]
         if missing:
             raise FormatError(f"camera {images[missing[0]].label} has no sensor", where=self.path)
-        used = [key for key in images if key in set(seen.image)]
         names = _unique([images[key].label for key in used])
-        points = list(dict.fromkeys(seen.point))
+        points = list(dict.fromkeys(name for _, name, *_ in seen))
         sensors = list(dict.fromkeys(images[key].sensor for key in used))
         row = {key: i for i, key in enumerate(used)}
         order = {name: j for j, name in enumerate(points)}
@@ -200,13 +194,10 @@ class _Chunk:
             s, r, t = similarity[images[key].component]
             x0[i] = s * r @ matrix[:3, 3] + t
             turns[i] = matrix_to_vector((r @ matrix[:3, :3]).T)
-        xyz, sigma = np.full((len(points), 3), np.nan), np.full((len(points), 3), np.nan)
-        role = ["tie"] * len(points)
+        xyz = np.full((len(points), 3), np.nan)
         s, r, t = self.similarity(next(iter(similarity)))
         for j, name in enumerate(points):
-            if name in control:
-                xyz[j], sigma[j], role[j] = control[name]
-            elif name in tie and not (known and not placed):
+            if name in tie and not (known and not placed):
                 xyz[j] = s * r @ tie[name] + t
         plain = [name.partition(":")[2] for name in points]
         labels = _unique([self.labels.get(name, plain[j]) for j, name in enumerate(points)])
@@ -219,15 +210,12 @@ class _Chunk:
             x0,
             tuple(labels),
             xyz,
-            (np.array([row[k] for k in seen.image], dtype=np.intp),
-             np.array([order[k] for k in seen.point], dtype=np.intp),
-             np.array(seen.xy) - 0.5,
-             np.repeat(np.array(seen.sigma)[:, None], 2, axis=1)),
+            [(row[key], order[name], x - 0.5, y - 0.5, sigma, sigma) for key, name, x, y, sigma in seen],
+            control={labels[j]: control[name] for j, name in enumerate(points) if name in control},
             files=tuple(images[key].file for key in used),
             unit="m",
         )  # fmt: skip
-        network = replace(network, sigma=sigma, role=tuple(role))
-        return replace(network, datum="control") if role.count("control") >= 3 else network
+        return replace(network, datum="control") if network.role.count("control") >= 3 else network
 
     def sensors(self) -> dict[str, Camera]:
         """Cameras by the id of the sensor."""
@@ -275,7 +263,7 @@ class _Chunk:
             for node in self.node.all("markers/marker")
         }
 
-    def control(self, usual: float) -> dict[str, tuple[Array, Array, str]]:
+    def control(self, usual: float) -> dict[str, Control]:
         """Coordinates, sigmas and role of markers with a reference; `usual` is their standard deviation."""
         system = self.node.find("reference")
         if system is not None and system.text and not system.text.startswith("LOCAL_CS"):
@@ -286,7 +274,7 @@ class _Chunk:
                     where=system.where,
                     do="convert the reference to local coordinates in Metashape, then export again",
                 )
-        found = dict[str, tuple[Array, Array, str]]()
+        found = dict[str, Control]()
         for node in self.node.all("markers/marker"):
             given = node.find("reference")
             if given is None or not all(given.get(axis) for axis in "xyz"):
@@ -296,7 +284,7 @@ class _Chunk:
             sigma = [given.number("sx", plane), given.number("sy", plane), given.number("sz", every)]
             if min(sigma) <= 0:
                 raise FormatError("has an accuracy that is not positive", where=given.where)
-            found[f"marker:{node.attribute('id')}"] = (
+            found[f"marker:{node.attribute('id')}"] = Control(
                 np.array([given.number(axis) for axis in "xyz"]),
                 # A check point is compared with its coordinates, which are no observations.
                 np.array(sigma) if _on(given) else np.full(3, np.nan),
@@ -318,10 +306,7 @@ class _Chunk:
                 if key not in images or at.get("valid", "true") == "false" or (key, name) in twice:
                     continue
                 twice.add((key, name))
-                seen.image.append(key)
-                seen.point.append(name)
-                seen.xy.append(np.array([at.number("x"), at.number("y")]))
-                seen.sigma.append(sigma)
+                seen.append((key, name, at.number("x"), at.number("y"), sigma))
         return seen
 
     def ties(self, images: dict[str, _Image], seen: _Seen, sigma: float) -> dict[str, Array]:
@@ -341,12 +326,9 @@ class _Chunk:
             table = _ply(self.part(file), f"{self.path}, {file}")
             _, first = np.unique(table["id"], return_index=True)
             table = table[np.sort(first)]
-            names = [f"tie:{k}" for k in table["id"].tolist()]
-            keep = [i for i, name in enumerate(names) if name in xyz]
-            seen.image += [key] * len(keep)
-            seen.point += [names[i] for i in keep]
-            seen.xy += list(_columns(table, "xy")[keep])
-            seen.sigma += [sigma] * len(keep)
+            for k, (x, y) in zip(table["id"].tolist(), _columns(table, "xy").tolist(), strict=True):
+                if f"tie:{k}" in xyz:
+                    seen.append((key, f"tie:{k}", x, y, sigma))
         return xyz
 
 
@@ -408,21 +390,16 @@ def _camera(sensor: Node, corner: bool) -> Camera:
     free = properties.get("fixed", "false").lower() not in ("true", "1")
     used = [key for key in _DISTORTION if values[key] != 0]
     if kind == "fisheye" or not values["k4"]:
-        model = camera_model("fisheye" if kind == "fisheye" else "opencv")
         named = {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5, "p1": p1, "p2": p2}
         # k4 of a fisheye is the fourth coefficient, of OpenCV's plain model the first of the denominator.
         named |= {key: values[key] for key in (_RADIAL if kind == "fisheye" else _RADIAL[:3])}
-        order = np.array([named.get(key, 0.0) for key in model.names])
-        chosen = [key for key in model.names if key in ("fx", "fy", "cx", "cy", *used)] if free else []
-        return Camera(name, width, height, (1.0, 1.0), model.name, order, tuple(chosen))
+        chosen = ("fx", "fy", "cx", "cy", *used) if free else ()
+        return Camera.of(name, (width, height), "fisheye" if kind == "fisheye" else "opencv", named, chosen)
     # With a pitch of one, Brown's camera has pixels for millimetres; its y points up.
-    model = camera_model("brown_higher")
     named = {"c": fy, "x0": cx - width / 2, "y0": height / 2 - cy, "P1": p2 / fy, "P2": -p1 / fy}
     named |= {f"K{i}": values[f"k{i}"] / fy ** (2 * i) for i in range(1, 5)}
-    order = np.array([named.get(key, 0.0) for key in model.names])
-    keys = {"c", "x0", "y0", *(key.upper() for key in used)}
-    chosen = [key for key in model.names if key in keys] if free else []
-    return Camera(name, width, height, (1.0, 1.0), model.name, order, tuple(chosen), {"side": "object"})
+    chosen = ("c", "x0", "y0", *(key.upper() for key in used)) if free else ()
+    return Camera.of(name, (width, height), "brown_higher", named, chosen, options={"side": "object"})
 
 
 def _refuse(

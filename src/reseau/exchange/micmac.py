@@ -29,9 +29,8 @@ from ..core.data import Array, Mask, Rows
 from ..core.errors import FormatError, UsageError
 from ..core.files import head_of
 from ..io import read_text
-from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
-from .lines import network_of, numbers, read_bytes
+from .lines import Control, network_of, numbers, read_bytes
 from .markup import Node, read_markup
 
 _PATTERN = "Orientation-*.xml"
@@ -130,25 +129,20 @@ def read_micmac(path: Path | str, control_sigma: float | None = None) -> Network
             "has no image points beside it", where=path,
             do="put homologous points to Homol, or add the measured control points",
         )  # fmt: skip
-    columns = np.array(seen, dtype=np.float64)
-    xyz, sigma = np.full((len(names), 3), np.nan), np.full((len(names), 3), np.nan)
-    for name, (place, spread) in given.items():
-        xyz[at[name]], sigma[at[name]] = place, spread
+    sigma = np.array([spread for _, spread in given.values()]).reshape(-1, 3)
     if control_sigma is None and (sigma == 1).any() and ((sigma == 1) | np.isnan(sigma)).all():
         raise UsageError(
             "gives all control points the uncertainty 1, which is GCPConvert's default for Campari's factor",
             where=path, do="say how good they are: --control-sigma, 0.01 for 1 cm",
         )  # fmt: skip
-    sigma *= control_sigma or 1.0
-    network = network_of(
+    return network_of(
         tuple(cameras), tuple(images), np.array(camera_of, dtype=np.intp),
-        matrix_to_vector(np.array(turns)), np.array(centres), names, xyz,
-        (columns[:, 0].astype(np.intp), columns[:, 1].astype(np.intp), columns[:, 2:],
-         np.ones((len(columns), 2))),
+        matrix_to_vector(np.array(turns)), np.array(centres), names, np.full((len(names), 3), np.nan), seen,
+        control={
+            name: Control(place, spread * (control_sigma or 1.0), "control")
+            for name, (place, spread) in given.items() if np.isfinite(spread).all()
+        },
     )  # fmt: skip
-    known = np.isfinite(sigma).all(axis=1)
-    role = tuple("control" if one else "tie" for one in known)
-    return replace(network, sigma=sigma, role=role)
 
 
 def read_interior(path: Path) -> Camera:
@@ -164,39 +158,32 @@ def read_interior(path: Path) -> Camera:
     return _camera(read_markup(path).need("CalibrationInternConique"), path.stem)
 
 
-def interior_text(values: Mapping[str, float], size: tuple[int, int], pitch_mm: float, side: str) -> str:
+def interior_text(camera: Camera) -> str:
     """Return the text of an interior orientation.
 
     Parameters
     ----------
-    values : mapping of str to float
-        Parameters of Brown's camera.
-    size : (int, int)
-        Width and height, px.
-    pitch_mm : float
-        Pixel size.
-    side : str
-        Side of the distortion.
+    camera : Camera
+        Of Brown's model, with square pixels.
 
     Examples
     --------
-    >>> text = interior_text({"c": 8.0, "K1": 1e-4}, (640, 480), 0.01, "object")
+    >>> camera = Camera.of("a", (640, 480), "brown", {"c": 8.0, "K1": 1e-4}, pitch_mm=(0.01, 0.01))
+    >>> text = interior_text(camera)
     >>> "<PP>319.5 239.5</PP>" in text, "<F>800.0</F>" in text, "<CoeffDist>1e-08</CoeffDist>" in text
     (True, True, True)
     """
-    lens = camera_model("brown")
-    zero = Camera("", *size, (1.0, 1.0), "brown", np.zeros(len(lens.names)))
-    given = replace(zero, values=np.array([values.get(name, 0.0) for name in lens.names]))
-    v = replace(given.in_millimetres(1 / pitch_mm), pitch_mm=(1.0, 1.0)).parameters
-    place = f"{v['x0'] + (size[0] - 1) / 2!r} {(size[1] - 1) / 2 - v['y0']!r}"
+    in_pixels = replace(camera, pitch_mm=(1.0, 1.0)).in_millimetres(1 / camera.pitch_mm[0])
+    v, width, height = in_pixels.parameters, camera.width, camera.height
+    place = f"{v['x0'] + (width - 1) / 2!r} {(height - 1) / 2 - v['y0']!r}"
     radial = "".join(f"          <CoeffDist>{v[name]!r}</CoeffDist>\n" for name in ("K1", "K2", "K3"))
     signed = {name: 0.0 + sign * v[name.upper()] for name, sign in _SIGNS.items()}
     others = "".join(f"        <{name}>{value!r}</{name}>\n" for name, value in signed.items())
-    convention = next(name for name, known in _SIDES.items() if known == side)
+    convention = next(name for name, known in _SIDES.items() if known == camera.options["side"])
     return (
         f'<?xml version="1.0" ?>\n<ExportAPERO>\n  <CalibrationInternConique>\n'
         f"    <KnownConv>{convention}</KnownConv>\n    <PP>{place}</PP>\n    <F>{v['c']!r}</F>\n"
-        f"    <SzIm>{size[0]} {size[1]}</SzIm>\n    <CalibDistortion>\n      <ModPhgrStd>\n"
+        f"    <SzIm>{width} {height}</SzIm>\n    <CalibDistortion>\n      <ModPhgrStd>\n"
         f"        <RadialePart>\n          <CDist>{place}</CDist>\n{radial}        </RadialePart>\n{others}"
         f"      </ModPhgrStd>\n    </CalibDistortion>\n  </CalibrationInternConique>\n</ExportAPERO>\n"
     )
@@ -223,9 +210,8 @@ def _camera(inside: Node, name: str) -> Camera:
     values = {"c": focal, "x0": pp[0] - (width - 1) / 2, "y0": (height - 1) / 2 - pp[1]}
     for element in inside.all("CalibDistortion"):
         values |= _distortion(element)
-    model = camera_model("brown_higher" if values.get("K4", 0.0) or values.get("K5", 0.0) else "brown")
-    column, options = np.array([values.get(key, 0.0) for key in model.names]), {"side": _SIDES[convention]}
-    return Camera(name, width, height, (1.0, 1.0), model.name, column, (), options)
+    model = "brown_higher" if values.get("K4", 0.0) or values.get("K5", 0.0) else "brown"
+    return Camera.of(name, (width, height), model, values, options={"side": _SIDES[convention]})
 
 
 def _distortion(element: Node) -> dict[str, float]:

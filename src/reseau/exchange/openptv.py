@@ -26,7 +26,7 @@ from ..optics.poses import matrix_to_vector
 from ..optics.refraction import RefractedRays, Window
 from ..optics.refraction.windows import Refraction, RefractiveIndex
 from .calibrations.openptv import OPENPTV, read
-from .lines import network_of, numbers
+from .lines import Control, network_of, numbers
 
 # Second nearest detection, in the distance of the nearest (px, at least one), that leaves no doubt.
 _DISTINCT = 2.0
@@ -102,7 +102,10 @@ def read_openptv(folder: Path | str) -> Network:
     labels = tuple(file.stem for file in files)
     if len(set(labels)) < count:
         labels = tuple(f"cam{k + 1}" for k in range(count))
-    cameras = tuple(_camera(label, file, free) for label, file in zip(labels, orientations, strict=True))
+    cameras = tuple(
+        replace(read(read_text(file), file, free), id=label)
+        for label, file in zip(labels, orientations, strict=True)
+    )
     turn, x0 = np.stack([one.turn for one in oriented]), np.stack([one.x0 for one in oriented])
     refraction = _refraction(setup, oriented, orientations)
     reach = _reach(parameters / "sortgrid.par")
@@ -118,16 +121,12 @@ def read_openptv(folder: Path | str) -> Network:
             f"no detection is within {reach:g} px of a point of the target", where=folder,
             do="improve the orientations, or enlarge the distance in parameters/sortgrid.par",
         )  # fmt: skip
-    image, point = (np.array([row[c] for row in seen], dtype=np.intp) for c in (0, 1))
-    xy = np.array([row[2:] for row in seen], dtype=np.float64)
     network = network_of(
         cameras, labels, np.arange(count), matrix_to_vector(turn), x0, names, xyz,
-        (image, point, xy, np.ones((len(xy), 2))), files=tuple(file.name for file in files), unit="mm",
+        seen, files=tuple(file.name for file in files), unit="mm",
+        control={name: Control(at, np.zeros(3), "control") for name, at in zip(names, xyz, strict=True)},
     )  # fmt: skip
-    return replace(
-        network, sigma=np.zeros_like(xyz), role=("control",) * len(names), datum="control",
-        refraction=refraction,
-    )  # fmt: skip
+    return replace(network, datum="control", refraction=refraction)
 
 
 def _words(path: Path) -> list[str]:
@@ -188,12 +187,6 @@ def _orientation(path: Path) -> _Oriented:
     # The rotation has seven digits.
     u, _, vt = np.linalg.svd(_OUTSIDE @ values[6:15].reshape(3, 3).T)
     return _Oriented(values[:3], u @ vt, values[18:21])
-
-
-def _camera(name: str, path: Path, free: tuple[str, ...]) -> Camera:
-    found = read(read_text(path), path)
-    values = np.array(found.of(*OPENPTV))
-    return Camera(name, found.width, found.height, found.pitch_mm, "openptv", values, free)
 
 
 def _refraction(setup: _Setup, oriented: list[_Oriented], files: list[Path]) -> Refraction | None:

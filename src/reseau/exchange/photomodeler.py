@@ -116,8 +116,9 @@ def read_photomodeler(path: Path | str) -> Network:
         table.append([images[words[0]], rows[words[1]], *numbers(words[2:], 4, path, lines.number)])
     if not table:
         raise FormatError("contains no observations", where=path)
-    values, table_of = np.array(poses), np.array(table)
-    sigma = _sigmas(table_of[:, 4:6], path)
+    values, seen = np.array(poses), np.array(table)
+    seen[:, 2:4] -= 0.5
+    seen[:, 4:] = _sigmas(seen[:, 4:], path)
     omega, phi, kappa = np.radians(values[:, [5, 4, 3]]).T
     # The file counts images from zero, the user interface of PhotoModeler from one.
     return network_of(
@@ -128,12 +129,7 @@ def read_photomodeler(path: Path | str) -> Network:
         values[:, :3],
         tuple(points),
         np.array(xyz),
-        (
-            table_of[:, 0].astype(np.intp),
-            table_of[:, 1].astype(np.intp),
-            table_of[:, 2:4] - 0.5,
-            sigma,
-        ),
+        seen,
         files=tuple(files),
     )
 

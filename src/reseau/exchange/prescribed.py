@@ -76,6 +76,29 @@ def finite(word: str) -> float:
     return value
 
 
+def scale_of(stated: list[str] | None, known: Mapping[str, tuple[str, float]], notes: list[str]) -> float:
+    """Millimetres of the unit of lengths that a file states, of those that a program has.
+
+    Examples
+    --------
+    >>> notes = []
+    >>> scale_of(["CM"], {"MM": ("mm", 1.0), "CM": ("cm", 10.0)}, notes), notes
+    (10.0, ['is in cm; lengths are converted to mm'])
+    """
+    if stated is None:
+        notes.append("states no unit; lengths are taken as mm")
+        return 1.0
+    word = stated[0].upper() if stated else ""
+    if word not in known:
+        *names, last = known
+        do = f"expected {', '.join(names)} or {last}"
+        raise FormatError(f"has the unit {word!r}, which is not known", do=do)
+    unit, scale = known[word]
+    if scale != 1:
+        notes.append(f"is in {unit}; lengths are converted to mm")
+    return scale
+
+
 def far(distance: float) -> float:
     """Distance of an object; infinite where it is a large number that stands for it."""
     return distance if distance < _FAR else np.inf

@@ -20,7 +20,6 @@ from ..bundle import Camera, Network
 from ..core.data import Array
 from ..core.errors import FormatError
 from ..io import read_text
-from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
 from .lines import network_of
 
@@ -129,16 +128,13 @@ def _network(scene: _Scene, path: Path) -> Network:
             "has no observed points", where=path,
             do="export the structure with its observations",
         )  # fmt: skip
-    columns = np.array(seen, dtype=np.float64)
     files = tuple(str(name) for name, _, _ in views.values())
     plain = len(set(files)) == len(files)
     return network_of(
         tuple(cameras.values()),
         tuple(Path(file).name if plain else key for key, file in zip(views, files, strict=True)),
         np.array([order.index(lens) for _, lens, _ in views.values()], dtype=np.intp),
-        rotation, x0, tuple(names), np.array(xyz, dtype=np.float64),
-        (columns[:, 0].astype(np.intp), columns[:, 1].astype(np.intp), columns[:, 2:],
-         np.ones((len(columns), 2))),
+        rotation, x0, tuple(names), np.array(xyz, dtype=np.float64), seen,
         files=files, notes=(f"{path.name} has no standard deviations of image points: taken as 1 px",),
     )  # fmt: skip
 
@@ -149,14 +145,12 @@ def _camera(name: str, lens: _Lens, path: Path) -> Camera:
             f"has the camera model {lens.model!r}", where=path, do=f"known are {', '.join(_MODELS)}"
         )
     kind, names = _MODELS[lens.model]
-    model, (width, height) = camera_model(kind), lens.size
     if not (lens.focal > 0).all() or min(lens.size) < 1:
-        raise FormatError(f"has the focal length {lens.focal[0]:g} and the size {width}×{height}", where=path)
+        size = "×".join(map(str, lens.size))
+        raise FormatError(f"has the focal length {lens.focal[0]:g} and the size {size}", where=path)
     values = {"fx": lens.focal[0], "fy": lens.focal[1], "cx": lens.centre[0], "cy": lens.centre[1]}
     values |= dict(zip(names, lens.coefficients, strict=True))
-    free = tuple(key for key in model.of_role("scale", "distortion") if key in values)
-    column = np.array([values.get(key, 0.0) for key in model.names], dtype=np.float64)
-    return Camera(name, width, height, (1.0, 1.0), kind, column, free)
+    return Camera.of(name, lens.size, kind, values, values.keys() - {"cx", "cy"})
 
 
 def _size(entry: Mapping[str, Any]) -> tuple[int, int]:

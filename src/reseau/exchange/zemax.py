@@ -22,11 +22,12 @@ from .prescribed import (
     finite,
     glasses_beside,
     kind_behind,
+    scale_of,
     with_stop,
     within,
 )
 
-_UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "METER": 1000.0}
+_UNITS = {"MM": ("MM", 1.0), "CM": ("CM", 10.0), "IN": ("IN", 25.4), "METER": ("METER", 1000.0)}
 _TYPES = ("STANDARD", "EVENASPH", "COORDBRK")
 _OPENINGS: dict[
     str, Literal["diameter", "f-number", "working f-number", "object aperture", "stop"]
@@ -164,7 +165,7 @@ def _lens(
     header: dict[str, list[str]], listed: list[_Listed], stem: str, own: Mapping[str, Medium]
 ) -> Prescription:
     notes: list[str] = []
-    scale = _scale(header, notes)
+    scale = scale_of(header.get("UNIT"), _UNITS, notes)
     wavelengths, weights, reference = _wavelengths(header)
     if len(header.get("MNUM", [])) and _number(header, "MNUM", 0) > 1:
         notes.append(f"of {header['MNUM'][0]} configurations, that which the file shows is read")
@@ -227,19 +228,6 @@ def _number(header: dict[str, list[str]], key: str, at: int, default: float | No
         return finite(words[at])
     except (IndexError, ValueError):
         raise FormatError(f"`{key} {' '.join(words)}` has no number") from None
-
-
-def _scale(header: dict[str, list[str]], notes: list[str]) -> float:
-    """Millimetres of the unit of lengths."""
-    if "UNIT" not in header:
-        notes.append("states no unit; lengths are taken as mm")
-        return 1.0
-    unit = header["UNIT"][0].upper() if header["UNIT"] else ""
-    if unit not in _UNITS:
-        raise FormatError(f"has the unit {unit!r}, which is not known", do="expected MM, CM, IN or METER")
-    if unit != "MM":
-        notes.append(f"is in {unit}; lengths are converted to mm")
-    return _UNITS[unit]
 
 
 def _wavelengths(header: dict[str, list[str]]) -> tuple[tuple[float, ...], tuple[float, ...], int]:

@@ -79,6 +79,7 @@ class BoardDesign(Document):
     """
 
     SCHEMA: ClassVar[str] = "reseau-board/1"
+    LEFT_OUT: ClassVar[dict[str, Any]] = {"exclude_defaults": True}
     name: str
     unit: Literal["mm"]
     kind: BoardKind
@@ -129,13 +130,6 @@ class BoardDesign(Document):
     @property
     def _room(self) -> float:
         return self.pitch * (np.sqrt(2) if self.asymmetric else 1.0)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content of the file; keys that the kind does not need are left out."""
-        content = super().to_dict()
-        fresh = {key: field.default for key, field in type(self).model_fields.items()}
-        plain = {key: list(v) if isinstance(v, tuple) else v for key, v in fresh.items()}
-        return {k: v for k, v in content.items() if k not in plain or v != plain[k]}
 
     @property
     def staggered(self) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from pydantic import Field, model_validator
 
-from ..core.data import Array
+from ..core.data import Array, twice
 from .document import Document, Strict
 
 Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
@@ -122,11 +122,9 @@ class ReseauDesign(Document):
     def _consistent(self) -> Self:
         if not self.points:
             raise ValueError("the design has no points")
-        names = set()
-        for point in self.points:
-            if point.id in names:
-                raise ValueError(f"duplicate id {point.id!r} in `points`")
-            names.add(point.id)
+        names = set(self.ids)
+        if (again := twice(self.ids)) is not None:
+            raise ValueError(f"duplicate id {again!r} in `points`")
         self._check_places()
         for role in ("origin", "axis"):
             named = getattr(self, role)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import ImageError, InputError
 from ..core.optional import optional
-from .scans import CHANNELS, Scan
+from .scans import CHANNELS, Scan, check_least, check_most
 
 _SUFFIXES = (".dcm", ".dicom", ".dic", ".ima")
 
@@ -103,10 +103,8 @@ def open_dicom(path: Path, number: int | None, most_pixels: int) -> Scan:
         syntax = header.file_meta.get("TransferSyntaxUID", None) if hasattr(header, "file_meta") else None
     if not rows or not columns:
         raise ImageError("is a DICOM file without an image", where=path)
-    if min(rows, columns) < 2:
-        raise ImageError(f"has {columns}×{rows} pixels, fewer than 2×2", where=path)
-    if rows * columns > most_pixels:
-        raise ImageError(f"has {columns}×{rows} pixels, more than {most_pixels:,}", where=path, do="crop it")
+    check_least(path, columns, rows)
+    check_most(path, columns, rows, most_pixels)
     index = 0 if number is None else number - 1
     if not 0 <= index < count:
         raise ImageError(f"has {count} frames; there is no frame {number}", where=path)

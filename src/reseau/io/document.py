@@ -6,8 +6,9 @@ import json
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
+from ..core.data import twice
 from ..core.errors import FormatError, InputError
 from ..core.files import write_whole
 from ..core.provenance import canonical_json
@@ -32,6 +33,29 @@ class Strict(BaseModel):
 
     # A model is built when it is used first: importing needs few of them.
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True, defer_build=True)
+
+
+class Columns(Strict):
+    """Columns of one length."""
+
+    @classmethod
+    def _column_names(cls) -> tuple[str, ...]:
+        """Names of the columns; empty where all fields are columns."""
+        return ()
+
+    @model_validator(mode="after")
+    def _one_length(self) -> Self:
+        length = None
+        for name, info in type(self).model_fields.items():
+            column = getattr(self, name)
+            if column is None or (self._column_names() and name not in self._column_names()):
+                continue
+            length = len(column) if length is None else length
+            if len(column) != length:
+                raise ValueError(
+                    f"column `{info.alias or name}` has {len(column)} entries, the first {length}"
+                )
+        return self
 
 
 def read_text(path: Path, otherwise: str | None = None) -> str:
@@ -75,11 +99,9 @@ class _Duplicate(Exception):
 
 
 def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise _Duplicate(next(name for name in names if names.count(name) > 1))
-    return found
+    if (again := twice(name for name, _ in pairs)) is not None:
+        raise _Duplicate(again)
+    return dict(pairs)
 
 
 def _one_line(error: ValidationError) -> str:
@@ -120,6 +142,7 @@ class Document(Strict):
     """
 
     SCHEMA: ClassVar[str]
+    LEFT_OUT: ClassVar[dict[str, Any]] = {}
 
     @classmethod
     def parse(cls, text: str, *, where: object) -> Self:
@@ -196,7 +219,7 @@ class Document(Strict):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file, ``schema`` first."""
-        return {"schema": self.SCHEMA} | self.model_dump(mode="json")
+        return {"schema": self.SCHEMA} | self.model_dump(mode="json", by_alias=True, **self.LEFT_OUT)
 
     def to_json(self) -> str:
         """Return the text of the file: same content, same bytes."""

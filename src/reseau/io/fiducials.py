@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from ..core.data import Array, ImagePoints
+from ..core.data import Array, ImagePoints, twice
 from .document import Document, Strict
 from .frame import FrameTransform, MeasuredCorner, points_of
 
@@ -153,6 +153,7 @@ class FiducialDesign(Document):
     """
 
     SCHEMA: ClassVar[str] = "fiducial-design/1"
+    LEFT_OUT: ClassVar[dict[str, Any]] = {"exclude_none": True}
     name: str
     source: str | None = None
     unit: Literal["mm"] = "mm"
@@ -162,10 +163,10 @@ class FiducialDesign(Document):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        ids = [point.id for point in self.points]
+        ids = self.ids
+        if (again := twice(ids)) is not None:
+            raise ValueError(f"duplicate id {again!r} in `points`")
         for point in self.points:
-            if ids.count(point.id) > 1:
-                raise ValueError(f"duplicate id {point.id!r} in `points`")
             if point.mark not in self.marks:
                 raise ValueError(f"point {point.id!r} has the mark {point.mark!r}, which is not in `marks`")
         xy = self.xy
@@ -197,19 +198,6 @@ class FiducialDesign(Document):
     def sigma(self) -> Array:
         """Standard deviations of the calibrated coordinates (n,); 0 where the design has none."""
         return np.array([point.sigma or 0.0 for point in self.points], dtype=np.float64)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content of the file; what is not given is left out."""
-        content = super().to_dict()
-        for mark in content["marks"].values():
-            mark["parts"] = [_given(part) for part in mark["parts"]]
-        content["marks"] = {name: _given(mark) for name, mark in content["marks"].items()}
-        content["points"] = [_given(point) for point in content["points"]]
-        return _given(content)
-
-
-def _given(entries: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in entries.items() if value is not None}
 
 
 class MeasuredFiducial(Strict):
@@ -305,4 +293,4 @@ class FiducialOrientation(Document):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file; what is not known is left out."""
-        return _given(super().to_dict())
+        return {name: value for name, value in super().to_dict().items() if value is not None}

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from ..core.data import Array, ImagePoints
+from ..core.data import Array, ImagePoints, covariances_of
 from .document import Document, Strict
 
 CORNERS = ("ul", "ur", "lr", "ll")
@@ -40,6 +40,7 @@ class FrameCorners(Document):
     """
 
     SCHEMA: ClassVar[str] = "frame-corners/1"
+    LEFT_OUT: ClassVar[dict[str, Any]] = {"exclude_none": True}
     unit: Literal["mm"] = "mm"
     corners: CornerPositions
     sigma: Pair | None = None
@@ -64,11 +65,6 @@ class FrameCorners(Document):
         """Create the document from corners (4, 2) in the order of `CORNERS`."""
         named = {name: (float(x), float(y)) for name, (x, y) in zip(CORNERS, xy, strict=True)}
         return cls(corners=CornerPositions(**named), sigma=sigma)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content of the file; unknown sigmas are left out."""
-        content = super().to_dict()
-        return content if self.sigma is not None else {k: v for k, v in content.items() if k != "sigma"}
 
 
 class MeasuredCorner(Strict):
@@ -102,9 +98,9 @@ def points_of(measured: Mapping[str, MeasuredCorner]) -> ImagePoints:
     >>> points_of({"ul": MeasuredCorner(x=10.5, y=20.25, sx=0.1, sy=0.2, rho=0.0)}).sigma
     array([[0.1, 0.2]])
     """
-    xy = np.array([(c.x, c.y) for c in measured.values()], dtype=np.float64).reshape(-1, 2)
-    cov = [[[c.sx**2, c.rho * c.sx * c.sy], [c.rho * c.sx * c.sy, c.sy**2]] for c in measured.values()]
-    return ImagePoints(tuple(measured), xy, np.array(cov, dtype=np.float64).reshape(-1, 2, 2))
+    rows = [(c.x, c.y, c.sx, c.sy, c.rho) for c in measured.values()]
+    x, y, *spread = np.array(rows, dtype=np.float64).reshape(-1, 5).T
+    return ImagePoints(tuple(measured), np.stack([x, y], axis=1), covariances_of(*spread))
 
 
 class FormatCandidate(Strict):

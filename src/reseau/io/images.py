@@ -34,7 +34,7 @@ from . import write_whole
 from .dicom import is_dicom, open_dicom
 from .photographs import decoded_heic, decoded_raw, is_heic, is_raw, mosaic_of_raw
 from .profiles import curve_of_file, curve_of_profile
-from .scans import CHANNELS, Scan, Window, full_scale_of, scan_of
+from .scans import CHANNELS, Scan, Window, check_least, check_most, full_scale_of, scan_of
 
 MAX_PIXELS = 500_000_000
 """The largest image that is read whole; its header is checked before a pixel is decoded."""
@@ -99,7 +99,7 @@ def read_image(path: Path | str, channel: Channel = "luma", digest: str | None =
         raise UsageError("is not a channel", where=channel, do="use luma, red, green, blue or interpolated")
     scan = open_scan(path, mosaic=channel == "luma")
     digest = sha256_of(path) if digest is None else digest
-    _check_size(path, scan.width, scan.height)
+    check_most(path, scan.width, scan.height, MAX_PIXELS)
     pixels = scan.window(0, scan.height, 0, scan.width)
     grey = np.array(pixels[:, :, 0]) if len(scan.channels) == 1 else grey_of(pixels, channel, scan.channels)
     return Frame(grey, scan.full_scale, scan.name, digest, scan.notes, scan.curve, scan.filters)
@@ -183,20 +183,10 @@ def open_scan(path: Path | str, *, mosaic: bool = False) -> Scan:
         decoded, notes = decoded_coded(path, kind, MAX_PIXELS)
         return replace(scan_of(decoded, path.name), notes=notes)
     pixels = _decoded(path, magic)
-    _check_least(path, pixels.shape[1], pixels.shape[0])
+    check_least(path, pixels.shape[1], pixels.shape[0])
     if pixels.ndim == 3:
         pixels = pixels[:, :, 2::-1] if pixels.shape[2] >= 3 else pixels[:, :, :1]
     return replace(scan_of(pixels, path.name, _coded_dpi(magic)), curve=curve_of_file(path, magic))
-
-
-def _check_size(path: Path, width: int, height: int) -> None:
-    if width * height > MAX_PIXELS:
-        raise ImageError(f"has {width}×{height} pixels, more than {MAX_PIXELS:,}", where=path, do="crop it")
-
-
-def _check_least(path: Path, width: int, height: int) -> None:
-    if min(width, height) < 2:
-        raise ImageError(f"has {width}×{height} pixels, fewer than 2×2", where=path)
 
 
 # PNG, JPEG and BMP
@@ -206,7 +196,7 @@ def _decoded(path: Path, magic: bytes) -> NDArray[Any]:
     """Pixels of a PNG, JPEG or BMP with the given first bytes: (h, w), or (h, w, c) in the order BGR."""
     import cv2
 
-    _check_size(path, *_header_size(magic, path))
+    check_most(path, *_header_size(magic, path), MAX_PIXELS)
     coded = np.fromfile(path, dtype=np.uint8)
     # The decoder fills the missing part of a truncated file with grey, silently: check the end mark.
     end = {b"\x89P": b"IEND", b"\xff\xd8": b"\xff\xd9"}.get(magic[:2], b"")
@@ -395,7 +385,7 @@ def _usable(page: Any, path: Path) -> float:
     full_scale = 255.0 if dtype.kind == "b" else full_scale_of(dtype, path)
     if page.samplesperpixel not in (1, 2, 3, 4) or page.imagedepth > 1:
         raise ImageError(f"is a TIFF of {page.samplesperpixel} samples per pixel", where=path, do=_HELP)
-    _check_least(path, page.imagewidth, page.imagelength)
+    check_least(path, page.imagewidth, page.imagelength)
     return full_scale
 
 
@@ -633,10 +623,10 @@ def decoded_coded(path: Path, kind: str, largest: int) -> tuple[NDArray[Any], tu
         with warnings.catch_warnings(), _whole_files():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path) as image:
-                width, height = image.size
-                if width * height <= largest:
-                    return _pixels(image), _notes(image)
-        raise ImageError(f"has {width}×{height} pixels, more than {largest:,}", where=path, do="crop it")
+                check_most(path, *image.size, largest)
+                return _pixels(image), _notes(image)
+    except ImageError:
+        raise
     except Image.DecompressionBombError as error:
         raise ImageError(
             "has more pixels than a file of its kind may have", where=path, do="crop it"

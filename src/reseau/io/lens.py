@@ -297,6 +297,7 @@ class LensDocument(Document):
     """
 
     SCHEMA: ClassVar[str] = "lens/1"
+    LEFT_OUT: ClassVar[dict[str, Any]] = {"exclude_defaults": True, "exclude_none": True}
     name: str
     unit: Literal["mm"] = "mm"
     wavelengths_nm: Annotated[tuple[Annotated[float, Field(ge=100, le=20000)], ...], Field(min_length=1)]
@@ -478,11 +479,6 @@ class LensDocument(Document):
             sensor=sensor,
             surface=tuple(rows),
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content of the file, ``schema`` first; what has its default is left out."""
-        content = self.model_dump(mode="json", by_alias=True, exclude_defaults=True, exclude_none=True)
-        return {"schema": self.SCHEMA} | content
 
     def to_toml(self) -> str:
         """Return the text of the file: same content, same bytes."""

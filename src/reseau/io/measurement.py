@@ -13,10 +13,12 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from ..core.data import Array, ImagePoints, Mask
+from ..core.data import Array, ImagePoints, Mask, covariances_of, sigmas_of
 from ..core.errors import FormatError, UsageError
 from ..core.failure import Code, Failure, Remark
 from .document import Document, Strict, read_text
+
+_COLUMNS = ("x", "y", "sx", "sy", "rho")
 
 
 class MeasuredPoint(Strict):
@@ -86,12 +88,9 @@ class ReseauMeasurement(Document):
         """
         more = set(self.candidates) if uncertain else set()
         ok = [p for p in self.points if (p.ok or p.id in more) and p.x is not None and p.y is not None]
-        xy = np.array([(p.x, p.y) for p in ok], dtype=np.float64).reshape(-1, 2)
-        s = np.array([(p.sx or 1.0, p.sy or 1.0) for p in ok], dtype=np.float64).reshape(-1, 2)
-        cov = np.zeros((len(ok), 2, 2))
-        cov[:, 0, 0], cov[:, 1, 1] = s[:, 0] ** 2, s[:, 1] ** 2
-        cov[:, 0, 1] = cov[:, 1, 0] = np.array([p.rho or 0.0 for p in ok]) * s[:, 0] * s[:, 1]
-        return ImagePoints(tuple(p.id for p in ok), xy, cov)
+        rows = [(p.x, p.y, p.sx or 1.0, p.sy or 1.0, p.rho or 0.0) for p in ok]
+        x, y, *spread = np.array(rows, dtype=np.float64).reshape(-1, 5).T
+        return ImagePoints(tuple(p.id for p in ok), np.stack([x, y], axis=1), covariances_of(*spread))
 
     @classmethod
     def from_columns(
@@ -110,25 +109,14 @@ class ReseauMeasurement(Document):
 
         Coordinates are those of marks that are `ok`, and of `candidates`, whose names are not certain.
         """
-        points = []
         unsure = np.zeros(len(ids), dtype=bool) if candidates is None else candidates
-        for i, name in enumerate(ids):
-            if not (ok[i] or unsure[i]):
-                points.append(MeasuredPoint(id=name, ok=False, why=why[i]))
-                continue
-            sx, sy = np.sqrt(np.diagonal(cov[i]))
-            points.append(
-                MeasuredPoint(
-                    id=name,
-                    x=float(xy[i, 0]),
-                    y=float(xy[i, 1]),
-                    sx=float(sx),
-                    sy=float(sy),
-                    rho=float(cov[i, 0, 1] / (sx * sy)),
-                    ok=bool(ok[i]),
-                    why=why[i],
-                )
-            )
+        rows = np.column_stack([xy, *sigmas_of(cov)]).tolist()
+        points = [
+            MeasuredPoint(id=name, ok=bool(ok[i]), why=why[i], **dict(zip(_COLUMNS, row, strict=True)))
+            if ok[i] or unsure[i]
+            else MeasuredPoint(id=name, ok=False, why=why[i])
+            for i, (name, row) in enumerate(zip(ids, rows, strict=True))
+        ]
         return cls(
             image=image,
             sha256=sha256,

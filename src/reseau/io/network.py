@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
+from ..core.data import twice
 from ..core.errors import UsageError
 from ..optics.cameras.registry import additional_models, camera_model, camera_models
-from .document import Document, Strict
+from .document import Columns, Document, Strict
 from .refraction import RefractionEntry
 
 T = TypeVar("T")
@@ -51,9 +52,8 @@ class ShutterEntry(Strict):
     def _consistent(self) -> Self:
         if self.line_s == 0:
             raise ValueError("`line_s` of a shutter must not be zero")
-        twice = _twice(self.free)
-        if twice is not None:
-            raise ValueError(f"`free` of a shutter contains {twice!r} twice")
+        if (again := twice(self.free)) is not None:
+            raise ValueError(f"`free` of a shutter contains {again!r} twice")
         for name, sigma in (self.sigma or {}).items():
             if sigma <= 0:
                 raise ValueError(f"the sigma of {name!r} must be above zero")
@@ -133,9 +133,8 @@ class CameraEntry(Strict):
         for name in model.of_role("scale"):
             if name in self.parameters and self.parameters[name] <= 0:
                 raise ValueError(f"{who}: parameter {name!r} must be above zero")
-        twice = _twice(self.free)
-        if twice is not None:
-            raise ValueError(f"{who}: `free` contains {twice!r} twice")
+        if (again := twice(self.free)) is not None:
+            raise ValueError(f"{who}: `free` contains {again!r} twice")
         for name, sigma in (self.sigma or {}).items():
             if sigma <= 0:
                 raise ValueError(f"{who}: the sigma of {name!r} must be above zero")
@@ -213,33 +212,7 @@ AnyCamera = Annotated[
 ]
 
 
-class _Columns(Strict):
-    """Columns of one length."""
-
-    @classmethod
-    def _column_names(cls) -> tuple[str, ...]:
-        """Names of the columns; empty where all fields are columns."""
-        return ()
-
-    @model_validator(mode="after")
-    def _one_length(self) -> Self:
-        length = None
-        names = self._column_names()
-        for name, info in type(self).model_fields.items():
-            if names and name not in names:
-                continue
-            column = getattr(self, name)
-            if column is None:
-                continue
-            length = len(column) if length is None else length
-            if len(column) != length:
-                raise ValueError(
-                    f"column `{info.alias or name}` has {len(column)} entries, the first {length}"
-                )
-        return self
-
-
-class ImageColumns(_Columns):
+class ImageColumns(Columns):
     """Images: the camera of each, and its pose where it is known.
 
     Images with the same `exposure` were taken at once, by cameras that are fixed to each other (a rig).
@@ -257,7 +230,7 @@ class ImageColumns(_Columns):
     motion: tuple[Six | None, ...] | None = None
 
 
-class PointColumns(_Columns):
+class PointColumns(Columns):
     """Object points: coordinates where they are known, with their standard deviations."""
 
     id: tuple[str, ...]
@@ -266,7 +239,7 @@ class PointColumns(_Columns):
     role: tuple[Literal["tie", "control", "check"], ...]
 
 
-class ObservationColumns(_Columns):
+class ObservationColumns(Columns):
     """Image coordinates in pixels."""
 
     image: tuple[str, ...]
@@ -278,7 +251,7 @@ class ObservationColumns(_Columns):
     rho: tuple[float, ...] | None = None
 
 
-class DistanceColumns(_Columns):
+class DistanceColumns(Columns):
     """Observed distances between points, such as scale bars."""
 
     model_config = ConfigDict(populate_by_name=True)
@@ -293,7 +266,7 @@ class BaseColumns(DistanceColumns):
     """Known distances between the projection centres of cameras that are fixed to each other."""
 
 
-class TurntableEntry(_Columns):
+class TurntableEntry(Columns):
     """A turntable that carries the object, or the camera, with the angles of images.
 
     Images with the same `pose` differ by their angles only; without the column all do. The angle of an image
@@ -318,9 +291,8 @@ class TurntableEntry(_Columns):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        twice = _twice(self.image)
-        if twice is not None:
-            raise ValueError(f"image {twice!r} has two angles of the turntable")
+        if (again := twice(self.image)) is not None:
+            raise ValueError(f"image {again!r} has two angles of the turntable")
         for name, angle, sigma in zip(self.image, self.angle_deg, self.sigma_deg, strict=True):
             if sigma is not None and sigma < 0:
                 raise ValueError(f"the sigma of the angle of image {name!r} is negative")
@@ -353,6 +325,7 @@ class Network1(Document):
     """
 
     SCHEMA: ClassVar[str] = "reseau-network/1"
+    LEFT_OUT: ClassVar[dict[str, Any]] = {"exclude_none": True}
     unit: str
     cameras: tuple[AnyCamera, ...]
     images: ImageColumns
@@ -369,9 +342,8 @@ class Network1(Document):
     def _consistent(self) -> Self:
         cameras = [camera.id for camera in self.cameras]
         for what, ids in (("cameras", cameras), ("images", self.images.id), ("points", self.points.id)):
-            twice = _twice(ids)
-            if twice is not None:
-                raise ValueError(f"duplicate id {twice!r} in `{what}`")
+            if (again := twice(ids)) is not None:
+                raise ValueError(f"duplicate id {again!r} in `{what}`")
             if not ids:
                 raise ValueError(f"the network has no {what}")
         images, points = set(self.images.id), set(self.points.id)
@@ -427,9 +399,8 @@ class Network1(Document):
                 raise ValueError(f"point {point!r} in image {image!r}: its sigmas must be above zero")
             if table.rho is not None and not -1 < table.rho[k] < 1:
                 raise ValueError(f"point {point!r} in image {image!r}: rho must be between -1 and 1")
-        twice = _twice(zip(table.image, table.point, strict=True))
-        if twice is not None:
-            raise ValueError(f"point {twice[1]!r} is observed twice in image {twice[0]!r}")
+        if (again := twice(zip(table.image, table.point, strict=True))) is not None:
+            raise ValueError(f"point {again[1]!r} is observed twice in image {again[0]!r}")
         for columns, ends in ((self.distances, "points"), (self.bases, "cameras")):
             if columns is None:
                 continue
@@ -450,10 +421,6 @@ class Network1(Document):
                     f"image {image!r} has no group, but camera {camera!r} has parameters per group"
                 )
 
-    def to_dict(self) -> dict[str, Any]:
-        """The content of the file; optional keys without a value are left out."""
-        return {"schema": self.SCHEMA} | self.model_dump(mode="json", by_alias=True, exclude_none=True)
-
 
 def _known(name: str, names: Sequence[str]) -> str:
     if name not in names:
@@ -463,16 +430,6 @@ def _known(name: str, names: Sequence[str]) -> str:
 
 def _not_known(name: str, names: Sequence[str]) -> str:
     return f"{name!r} is not one of the models {', '.join(names)}"
-
-
-def _twice(names: Iterable[T]) -> T | None:
-    """The first name that occurs twice."""
-    seen: set[T] = set()
-    for name in names:
-        if name in seen:
-            return name
-        seen.add(name)
-    return None
 
 
 def _named(column: str, names: Sequence[str], known: set[str], what: str) -> None:

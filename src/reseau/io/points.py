@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.data import ImagePoints
+from ..core.data import ImagePoints, covariances_of
 from ..core.errors import FormatError
 
 POINTS = "reseau-points/1"
@@ -22,16 +22,7 @@ def points_document(points: ImagePoints, unit: str, system: str) -> dict[str, An
     >>> points_document(points, "px", "image")["points"]["rho"]
     [0.5]
     """
-    s = points.sigma
-    table = {
-        "id": list(points.names),
-        "x": points.xy[:, 0].tolist(),
-        "y": points.xy[:, 1].tolist(),
-        "sx": s[:, 0].tolist(),
-        "sy": s[:, 1].tolist(),
-        "rho": (points.cov[:, 0, 1] / (s[:, 0] * s[:, 1])).tolist(),
-    }
-    return {"schema": POINTS, "unit": unit, "system": system, "points": table}
+    return {"schema": POINTS, "unit": unit, "system": system, "points": points._columns()}
 
 
 def points_of(document: Mapping[str, Any], where: object) -> ImagePoints:
@@ -61,8 +52,7 @@ def points_of(document: Mapping[str, Any], where: object) -> ImagePoints:
         keys = ("x", "y", "sx", "sy", "rho")
         x, y, sx, sy, rho = (np.array(table[key], dtype=np.float64) for key in keys)
         known = np.asarray(np.isfinite([x, y, sx, sy, rho]).all(axis=0))
-        cov = np.stack([np.stack([sx * sx, rho * sx * sy], -1), np.stack([rho * sx * sy, sy * sy], -1)], -1)
         names = tuple(str(name) for name, one in zip(table["id"], known, strict=True) if one)
-        return ImagePoints(names, np.stack([x, y], axis=-1)[known], cov[known])
+        return ImagePoints(names, np.stack([x, y], axis=-1)[known], covariances_of(sx, sy, rho)[known])
     except (KeyError, TypeError, ValueError):
         raise FormatError(f"is not a complete {POINTS}", where=where) from None

@@ -98,6 +98,18 @@ class Scan:
         return out, float(r)
 
 
+def check_most(path: object, width: int, height: int, most: int) -> None:
+    """Refuse an image of more pixels than `most`."""
+    if width * height > most:
+        raise ImageError(f"has {width}×{height} pixels, more than {most:,}", where=path, do="crop it")
+
+
+def check_least(path: object, width: int, height: int) -> None:
+    """Refuse an image that is a line."""
+    if min(width, height) < 2:
+        raise ImageError(f"has {width}×{height} pixels, fewer than 2×2", where=path)
+
+
 def full_scale_of(dtype: np.dtype[Any], where: object) -> float:
     """Return the grey value at which an image of this type saturates.
 

@@ -7,16 +7,16 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from ..core.data import Array
+from ..core.data import Array, twice
 from ..optics.formation import Outline, mark_outline
-from .document import Document, Strict
+from .document import Columns, Document
 
 Triple = tuple[float, float, float]
 Length = Annotated[float, Field(gt=0, le=1e5)]
 Shape = Literal["disk", "square"]
 
 
-class TargetColumns(Strict):
+class TargetColumns(Columns):
     """Targets in columns.
 
     Parameters
@@ -48,17 +48,11 @@ class TargetColumns(Strict):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        for name in ("shape", "size", "normal", "side", "xyz"):
-            column = getattr(self, name)
-            if column is not None and len(column) != len(self.id):
-                raise ValueError(f"column `{name}` has {len(column)} entries, `id` {len(self.id)}")
         if not self.id:
             raise ValueError("there are no targets")
-        seen: set[str] = set()
+        if (again := twice(self.id)) is not None:
+            raise ValueError(f"duplicate id {again!r}")
         for k, name in enumerate(self.id):
-            if name in seen:
-                raise ValueError(f"duplicate id {name!r}")
-            seen.add(name)
             if not np.linalg.norm(self.normal[k]) > 0:
                 raise ValueError(f"target {name!r}: its normal is zero")
             if self.side is not None:

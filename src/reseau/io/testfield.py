@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from ..core.data import Array
+from ..core.data import Array, twice
 from .board import BoardDesign
 from .design import ReseauDesign, at_one_place
-from .document import Document, Strict
+from .document import Columns, Document, Strict
 
 TargetShape = Literal["square", "triangle", "cross", "circle"]
 SHAPES: tuple[TargetShape, ...] = ("square", "triangle", "cross", "circle")
@@ -78,7 +78,7 @@ class FieldLines(Strict):
         return self
 
 
-class FieldTargets(Strict):
+class FieldTargets(Columns):
     """The targets, in columns.
 
     Examples
@@ -100,13 +100,9 @@ class FieldTargets(Strict):
     angle: tuple[float, ...]
 
     @model_validator(mode="after")
-    def _columns(self) -> Self:
-        for name in ("square", "shape", "x", "y", "size", "angle"):
-            if len(getattr(self, name)) != len(self.id):
-                raise ValueError(f"`{name}` has {len(getattr(self, name))} entries for {len(self.id)} ids")
-        if len(set(self.id)) != len(self.id):
-            twice = next(name for i, name in enumerate(self.id) if name in self.id[:i])
-            raise ValueError(f"duplicate id {twice!r} in `targets`")
+    def _named_once(self) -> Self:
+        if (again := twice(self.id)) is not None:
+            raise ValueError(f"duplicate id {again!r} in `targets`")
         return self
 
 

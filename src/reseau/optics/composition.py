@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import ClassVar, Self
@@ -10,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.data import Array, Mask
+from ..core.data import Array, Mask, twice
 from ..core.errors import UsageError
 from .mapping import Derivatives, PlaneMapping, as_points, as_values
 from .newton import solve_2x2
@@ -238,16 +237,6 @@ class Chain(PlaneMapping):
 def _labelled(labels: tuple[str, str], first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:
     """Names of both mappings with their labels; chains of the same kind are formed again and again."""
     names = tuple(label + name for label, part in zip(labels, (first, second), strict=True) for name in part)
-    twice = _twice(names)
-    if twice is not None:
-        raise UsageError("is a parameter of both mappings", where=twice, do="give the chain labels")
+    if (both := twice(names)) is not None:
+        raise UsageError("is a parameter of both mappings", where=both, do="give the chain labels")
     return names
-
-
-def _twice(names: Iterable[str]) -> str | None:
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            return name
-        seen.add(name)
-    return None

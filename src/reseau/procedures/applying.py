@@ -28,6 +28,7 @@ from ..calibration.raster import planes_of, undistorted_camera, write_corrected
 from ..calibration.sensor import SensorCorrection
 from ..core.data import ImagePoints
 from ..core.errors import UsageError
+from ..core.numbers import or_null
 from ..core.provenance import Provenance, canonical_json, sha256_of
 from ..exchange.film import film_files
 from ..io import read_text
@@ -94,7 +95,7 @@ class AppliedPoints:
         content |= {"camera": dict(self.camera)} if self.camera else {}
         if any(self.why):
             table = {
-                key: [None if isinstance(v, float) and v != v else v for v in column]
+                key: [or_null(v) if isinstance(v, float) else v for v in column]
                 for key, column in content["points"].items()
             }
             content["points"] = table | {"ok": [not why for why in self.why], "why": list(self.why)}

@@ -22,6 +22,7 @@ from ..calibration import CameraMapping, Cause, projection_field
 from ..calibration.assessment import Assessment, ErrorMap, Use, two_digits
 from ..core.data import Array, Mask
 from ..core.failure import Code, Remark
+from ..core.numbers import or_null
 from .next_pose import next_photograph
 
 _CELLS, _EMPTY, _LIT = 12, 0.5, 0.3
@@ -69,8 +70,7 @@ def assess(result: Result, camera: int = 0, explanation: Explanation | None = No
     ()
     """
     lens = camera_mapping(result, camera)
-    used = result.fit.usable.observations & ~result.rejected
-    rows = np.flatnonzero(used & (result.network.camera_of[result.network.image_of] == camera))
+    rows = result.used_by(camera)
     explanation = explain(result) if explanation is None else explanation
     field = projection_field(lens, _ACROSS)
     formal = projection_field(camera_mapping(result, camera, formal=True), _ACROSS).sigma
@@ -82,7 +82,7 @@ def assess(result: Result, camera: int = 0, explanation: Explanation | None = No
         use=Use.of(total.worst_px),
         lines=(),
         centre_px=float(total.sigma[rows_down // 2, columns // 2]),
-        corners_px=total.worst_px if np.isfinite(total.worst_px) else None,
+        corners_px=or_null(total.worst_px),
         circular_deg=field.reach_deg if field.circular else 0.0,
         causes=explanation.causes,
         images=int((result.fit.usable.images & (result.network.camera_of == camera)).sum()),

@@ -18,13 +18,14 @@ import numpy as np
 
 from ..bundle import Network, Result, adjust_network
 from ..bundle import Options as BundleOptions
+from ..bundle.network.settings import observation_columns
 from ..core import vocabulary as v
 from ..core.data import Array, Frame, Mask, Rows
 from ..core.display import Display
 from ..core.errors import UsageError
 from ..core.executors import Executor, Here
 from ..core.failure import Code, Failure, Remark
-from ..io.network import Network1, ObservationColumns
+from ..io.network import Network1
 from ..io.targets import SpaceTargets
 from ..measure.blurred import BlurredOptions, measure_blurred
 from ..measure.blurred.measure import BlurredResult
@@ -272,19 +273,7 @@ def final_document(document: Network1, found: BlurredNetwork) -> Network1:
     >>> bool(final_document(network_document(network), found).observations.x[0] == network.xy[0, 0])
     True
     """
-    network = found.network
-    sigma = np.sqrt(np.diagonal(network.cov, axis1=1, axis2=2))
-    rho = network.cov[:, 0, 1] / sigma.prod(axis=1)
-    columns = ObservationColumns(
-        image=tuple(network.images[i] for i in network.image_of),
-        point=tuple(network.points[j] for j in network.point_of),
-        x=tuple(network.xy[:, 0].tolist()),
-        y=tuple(network.xy[:, 1].tolist()),
-        sx=tuple(sigma[:, 0].tolist()),
-        sy=tuple(sigma[:, 1].tolist()),
-        rho=tuple(rho.tolist()),
-    )
-    return document.model_copy(update={"observations": columns})
+    return document.model_copy(update={"observations": observation_columns(found.network)})
 
 
 def _ordinary(

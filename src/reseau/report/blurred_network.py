@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..core.data import Rows
-from ..core.figures import ACCENT, BLUE, FAINT, drawing, nice, to_svg
+from ..core.figures import ACCENT, BLUE, FAINT, draw_arrows, drawing, nice, to_svg
 from ..core.numbers import plain
 from ..core.provenance import Provenance
 from ..procedures.blurred_network import BlurredNetwork, BlurredRound
@@ -112,7 +112,4 @@ def _vectors(axes: Axes, entry: BlurredRound, i: int, enlarged: float) -> None:
     for chosen, colour in ((~by_rays, FAINT if entry.measured else BLUE), (by_rays, ACCENT)):
         part: Rows = seen[chosen].astype(np.intp)
         axes.plot(*network.xy[part].T, ".", color=colour, markersize=2)
-        axes.quiver(
-            *network.xy[part].T, *(enlarged * entry.result.residuals[part]).T, color=colour, angles="xy",
-            scale_units="xy", scale=1, width=0.004,
-        )  # fmt: skip
+        draw_arrows(axes, network.xy[part], enlarged * entry.result.residuals[part], colour)

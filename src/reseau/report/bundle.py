@@ -17,7 +17,7 @@ from ..calibration import CameraMapping, FieldDifference, projection_field
 from ..calibration.assessment import Assessment
 from ..core.data import Array, Frame, Rows
 from ..core.errors import UsageError
-from ..core.figures import ACCENT, FAINT, INK, drawing, nice, to_svg
+from ..core.figures import ACCENT, FAINT, INK, draw_arrows, drawing, nice, to_svg
 from ..core.numbers import aligned, at_power, measured, plain, power
 from ..core.provenance import Provenance
 from ..io.photographs import Exif
@@ -123,7 +123,7 @@ def bundle_report(
 def _verdict(result: Result, name: str, assessed: Assessment) -> dict[str, Any]:
     """The verdict on a camera, with the next photograph."""
     c = [entry.id for entry in result.network.cameras].index(name)
-    rows = _rows(result, c)
+    rows = result.used_by(c)
     drawn = next_figure(result, c, rows, assessed)
     errors = None if assessed.errors is None else errors_figure(assessed.errors, result.network.xy[rows])
     return {
@@ -163,7 +163,7 @@ def _photographs(
     if photograph is None:
         return []
     network = result.network
-    good = result.fit.usable.observations & ~result.rejected
+    good = result.used
     squares = np.where(good, np.nan_to_num(result.residuals**2).sum(axis=1), 0.0)
     number = np.bincount(network.image_of[good], minlength=len(network.images))
     mean = np.bincount(network.image_of, squares, len(network.images)) / np.maximum(number, 1)
@@ -199,14 +199,8 @@ def _shown(result: Result) -> list[int]:
     return [
         c
         for c in range(len(result.network.cameras))
-        if len(result.camera_columns(c)[0]) and len(_rows(result, c))
+        if len(result.camera_columns(c)[0]) and len(result.used_by(c))
     ]
-
-
-def _rows(result: Result, c: int) -> Rows:
-    """Image points of a camera that are used."""
-    seen = result.network.camera_of[result.network.image_of] == c
-    return np.flatnonzero(seen & result.fit.usable.observations & ~result.rejected).astype(np.intp)
 
 
 def _summary(result: Result) -> list[tuple[str, str, str]]:
@@ -229,7 +223,7 @@ def _reliability(result: Result) -> list[tuple[str, str, str]]:
     """Smallest detectable errors of image coordinates, and effects of undetected ones."""
     n = 2 * len(result.network.xy)
     error, length = result.minimal_detectable_errors(), result.fit.external_lengths()[:n]
-    kept = np.repeat(result.fit.usable.observations & ~result.rejected, 2)
+    kept = np.repeat(result.used, 2)
     error, length = error.ravel()[kept], length[kept]
     error, length = error[np.isfinite(error)], length[np.isfinite(length)]
     if not len(error) or not len(length):
@@ -256,15 +250,14 @@ def _camera(
         rows.append(
             {
                 "name": name,
-                "estimate": power(value, s),
+                **_estimate(value, s, camera.unit_of(name)),
                 "formal": at_power(formal, power(value, s)),
-                "unit": unit_text(camera.unit_of(name)),
                 "statistic": "" if test is None else f"{test.statistic:.1f}",
                 "p": "" if test is None else f"{test.p:.3f}" if test.p >= 5e-4 else "< 0.001",
                 "verdict": "" if test is None or test.significant else "not significant",
             }
         )
-    at = _rows(result, c)
+    at = result.used_by(c)
     lens = _lens(result, c)
     profile = None if lens is None else distortion_figure(lens, None if assessed is None else assessed.errors)
     return {
@@ -277,6 +270,11 @@ def _camera(
     }
 
 
+def _estimate(value: float, sigma: float, unit: str) -> dict[str, Any]:
+    """An estimate and its unit, as rows of tables have them."""
+    return {"estimate": power(float(value), float(sigma)), "unit": unit_text(unit)}
+
+
 def _refraction(result: Result) -> list[dict[str, Any]]:
     """Rows of the table of windows and media."""
     found = result.refraction
@@ -285,8 +283,7 @@ def _refraction(result: Result) -> list[dict[str, Any]]:
     return [
         {
             "name": name,
-            "estimate": power(float(value), float(sigma)),
-            "unit": unit_text(unit),
+            **_estimate(value, sigma, unit),
             "given": f"{given:g}",
             "p": f"{test.p:.3f}" if test.p >= 5e-4 else "< 0.001",
             "partner": partner,
@@ -310,8 +307,7 @@ def _motion(result: Result) -> list[dict[str, Any]]:
         {
             "image": image,
             "name": MOTION[k],
-            "estimate": power(float(found.values[i, k]), float(found.sigma[i, k])),
-            "unit": unit_text(units[k]),
+            **_estimate(found.values[i, k], found.sigma[i, k], units[k]),
         }
         for i, image in enumerate(found.names)
         for k in columns
@@ -332,13 +328,7 @@ def _rig(result: Result) -> list[dict[str, Any]]:
         turn = np.rad2deg(found.sigma[k, :3].max())
         values.append(("rotation", found.angles[k], turn, "deg"))
         rows += [
-            {
-                "camera": camera,
-                "reference": reference,
-                "name": name,
-                "estimate": power(float(value), float(sigma)),
-                "unit": unit_text(unit),
-            }
+            {"camera": camera, "reference": reference, "name": name, **_estimate(value, sigma, unit)}
             for name, value, sigma, unit in values
         ]
     return rows
@@ -361,10 +351,7 @@ def _turntable(result: Result) -> dict[str, Any] | None:
                  strict=True)  # fmt: skip
     return {
         "carries": found.carries,
-        "axis": [
-            {"name": name, "estimate": power(float(value), float(s)), "unit": unit_text(unit)}
-            for name, value, s, unit in axis
-        ],
+        "axis": [{"name": name, **_estimate(value, s, unit)} for name, value, s, unit in axis],
         "angles": [
             {
                 "image": image,
@@ -595,10 +582,7 @@ def _figure(result: Result, pattern: CommonPattern, grouped: bool) -> str:
             axes.remove()
         for axes, name in zip(grid.flat, names, strict=False):
             for chosen, colour in (((labels == name) & ~sure, INK), ((labels == name) & sure, ACCENT)):
-                axes.quiver(
-                    *pattern.xy[chosen].T, *(enlarged * pattern.shift[chosen]).T, color=colour, angles="xy",
-                    scale_units="xy", scale=1, width=0.004,
-                )  # fmt: skip
+                draw_arrows(axes, pattern.xy[chosen], enlarged * pattern.shift[chosen], colour)
             axes.set_xlim(0, camera.width)
             axes.set_ylim(camera.height, 0)
             axes.set_aspect("equal")

@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from ..bundle import Result
 from ..calibration import CameraMapping
 from ..calibration.assessment import Assessment, ErrorMap
 from ..core.data import Array, Rows
-from ..core.figures import ACCENT, BLUE, FAINT, INK, PALE, drawing, image_axes, nice, to_svg
+from ..core.figures import (
+    ACCENT,
+    BLUE,
+    FAINT,
+    INK,
+    PALE,
+    draw_arrows,
+    draw_ellipses,
+    drawing,
+    image_axes,
+    nice,
+    to_svg,
+)
 from ..optics.cameras.registry import distortion_names
 
 _MANY_POINTS, _ELLIPSES, _CELLS, _WEAK = 4000, 250, 12, 5.0
@@ -36,10 +47,7 @@ def network_figure(result: Result) -> str:
             axes.plot(xyz[:, a], xyz[:, b], ".", color=FAINT, markersize=2)
             view = values.rotation[part.images][:, 2]
             size = 0.08 * float(np.ptp(np.concatenate([xyz, x0]), axis=0).max())
-            axes.quiver(
-                x0[:, a], x0[:, b], size * view[:, a], size * view[:, b], color=BLUE, angles="xy",
-                scale_units="xy", scale=1, width=0.003,
-            )  # fmt: skip
+            draw_arrows(axes, x0[:, [a, b]], size * view[:, [a, b]], BLUE, 0.003)
             axes.plot(x0[:, a], x0[:, b], "^", color=BLUE, markersize=4)
             enlarged = _ellipses(axes, result, points, (a, b), 0.4 * size)
             axes.set_aspect("equal", adjustable="datalim")
@@ -53,24 +61,15 @@ def _ellipses(axes: Axes, result: Result, points: Rows, plane: tuple[int, int], 
     """Draw standard ellipses of some points; return the factor of enlargement."""
     some = points[:: max(1, len(points) // _ELLIPSES)]
     q = result.point_covariance[some][:, plane][:, :, plane]
-    values, vectors = np.linalg.eigh(q)
-    axis = np.sqrt(np.maximum(values, 0.0))
-    median = float(np.median(axis[:, 1])) if len(axis) else 0.0
+    axis = np.sqrt(np.maximum(np.linalg.eigvalsh(q)[:, 1], 0.0))
+    median = float(np.median(axis)) if len(axis) else 0.0
     if median == 0:
         return 1.0
     power = nice(size / median)
     # Weak points, which the warnings list, would cover the others.
-    shown = axis[:, 1] <= _WEAK * median
-    some, axis, vectors = some[shown], axis[shown], vectors[shown]
-    angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-    axes.add_collection(
-        EllipseCollection(
-            2 * power * axis[:, 1], 2 * power * axis[:, 0], angle, units="xy",
-            offsets=result.fit.values.xyz[some][:, plane], transOffset=axes.transData, facecolors="none",
-            edgecolors=ACCENT, linewidths=0.5,
-        )
-    )  # fmt: skip
-    return float(power)
+    shown = axis <= _WEAK * median
+    at = result.fit.values.xyz[some[shown]][:, plane]
+    return draw_ellipses(axes, at, q[shown], enlarged=power, linewidth=0.5)
 
 
 def residual_figure(result: Result, c: int, rows: Rows) -> str:
@@ -93,12 +92,8 @@ def residual_figure(result: Result, c: int, rows: Rows) -> str:
         x = (np.arange(across) + 0.5) * camera.width / across
         y = (np.arange(down) + 0.5) * camera.height / down
         longest = float(np.hypot(*mean.T).max()) or 1.0
-        scale = longest / (0.8 * camera.width / across)
-        gx, gy = np.meshgrid(x, y)
-        left.quiver(
-            gx, gy, mean[:, 0].reshape(gx.shape), mean[:, 1].reshape(gx.shape), color=ACCENT, angles="xy",
-            scale_units="xy", scale=scale, width=0.004,
-        )  # fmt: skip
+        enlarged = 0.8 * camera.width / across / longest
+        draw_arrows(left, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), enlarged * mean, ACCENT)
         image_axes(left, camera.width, camera.height, f"mean residuals; longest {longest:.2g} px")
         w = result.test_values[rows]
         w = w[np.isfinite(w)]

@@ -13,7 +13,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from ..core.data import Array
 from ..core.failure import Failure
-from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, image_axes, to_svg
+from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, image_axes, label_axes, to_svg
 from ..core.overlay import Layer, declined_layers, draw_overlay
 from ..procedures.edges import Sharpness
 from ..sensor import EdgeSpread, FreeCurve
@@ -161,15 +161,8 @@ def _curves(found: Sharpness) -> str:
                 right.plot(at, free.line_spread(at)[0], color=colour, lw=1.2)
         left.set(xlim=(0, 1), ylim=(0, 1.08))
         left.legend(frameon=False, fontsize=8.5, loc="upper right")
-        for axes, name, x, y in (
-            (left, "modulation transfer", "cycles per pixel, along the normal", ""),
-            (right, "line-spread function", "distance from the edge / px", "share of the step per px"),
-        ):
-            axes.set_title(name, loc="left")
-            axes.set_xlabel(x)
-            axes.set_ylabel(y)
-            for side in ("top", "right"):
-                axes.spines[side].set_visible(False)
+        label_axes(left, "modulation transfer", "cycles per pixel, along the normal", "")
+        label_axes(right, "line-spread function", "distance from the edge / px", "share of the step per px")
         return to_svg(figure)
 
 

@@ -5,11 +5,23 @@ from __future__ import annotations
 import numpy as np
 import scipy
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from ..core.data import Array, ImagePoints
-from ..core.figures import ACCENT, BLUE, FAINT, INK, Panel, beside, drawing, length, nice, plane_axes, to_svg
+from ..core.figures import (
+    ACCENT,
+    BLUE,
+    FAINT,
+    INK,
+    Panel,
+    beside,
+    draw_ellipses,
+    drawing,
+    length,
+    nice,
+    plane_axes,
+    to_svg,
+)
 
 PROBABILITY = 0.95
 """Probability that a point lies within its ellipse."""
@@ -57,8 +69,8 @@ def draw_body(
     named: bool = True,
 ) -> float:
     """Draw the content of :func:`body_map` into axes; return the factor of enlargement."""
-    variance, axis = np.linalg.eigh(true.cov)
-    semi = np.sqrt(variance * scipy.special.chdtri(2, 1 - PROBABILITY))
+    factor = scipy.special.chdtri(2, 1 - PROBABILITY)
+    semi = np.sqrt(np.linalg.eigvalsh(true.cov) * factor)
     both = np.concatenate([true.xy, rods])
     low, high = both.min(axis=0), both.max(axis=0)
     extent = float((high - low).max())
@@ -68,17 +80,7 @@ def draw_body(
     axes.set_ylim(low[1] - 2.2 * margin, high[1] + margin)
     plane_axes(axes, Panel(unit, labels=("X", "Y")), "")
     axes.plot(*rods.T, "+", color=FAINT, markersize=4, markeredgewidth=0.6, zorder=0)
-    turned = np.rad2deg(np.arctan2(axis[:, 1, 1], axis[:, 0, 1]))
-    ellipses = EllipseCollection(
-        2 * enlarged * semi[:, 1],
-        2 * enlarged * semi[:, 0],
-        turned,
-        units="xy",
-        offsets=true.xy,
-        offset_transform=axes.transData,
-    )
-    ellipses.set(facecolor=BLUE + "18", edgecolor=BLUE, linewidth=0.7)
-    axes.add_collection(ellipses)
+    draw_ellipses(axes, true.xy, factor * true.cov, BLUE, enlarged, facecolor=BLUE + "18", linewidth=0.7)
     axes.plot(*true.xy.T, ".", color=INK, markersize=2.2)
     if errors is not None:
         ends = true.xy - enlarged * errors

@@ -5,12 +5,13 @@ from __future__ import annotations
 import base64
 from dataclasses import dataclass, field
 from html import escape
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.data import Array, Frame, Mask
+from ..core.data import Array, Frame, ImagePoints, Mask
 from ..core.figures import ACCENT
 
 _WIDTH = 1200
@@ -66,6 +67,14 @@ class Marks:
     arcs: Arcs | None = None
     labels: dict[str, str] = field(default_factory=dict)
     shifts: Array | None = None
+
+
+def marks_of(points: ImagePoints, found: Any, check: tuple[str, ...] = (), **more: Any) -> Marks:
+    """Marks of points, or of a measurement of marks or rods: lost ones are at their predicted places."""
+    if found is None:
+        return Marks(points.names, points.xy, np.ones(len(points), dtype=bool), check, **more)
+    xy = np.where(found.ok[:, None], found.xy, found.predicted)
+    return Marks(found.ids, xy, found.ok, check, **more)
 
 
 def preview(frame: Frame, width: int = _WIDTH) -> NDArray[np.uint8]:

@@ -16,7 +16,7 @@ from ..procedures.oscilloscope import PhotoI
 from ..refine import CorrectionFit
 from .comparison import similarity_residuals
 from .figures import distortion_figure, residual_figure
-from .overlay import Marks, frame_overlay
+from .overlay import frame_overlay, marks_of
 from .tables import (
     Estimates,
     Item,
@@ -106,12 +106,7 @@ def _summary(found: PhotoI, fit: CorrectionFit, before: Array, after_check: Arra
 
 
 def _overlay(found: PhotoI, frame: Frame, fit: CorrectionFit) -> str:
-    measured, check = found.measured, fit.check.names
-    if measured is None:
-        names, xy = found.points.names, found.points.xy
-        return frame_overlay(frame, Marks(names, xy, np.ones(len(names), dtype=bool), check))
-    xy = np.where(measured.ok[:, None], measured.xy, measured.predicted)
-    return frame_overlay(frame, Marks(measured.ids, xy, measured.ok, check))
+    return frame_overlay(frame, marks_of(found.points, found.measured, fit.check.names))
 
 
 def _estimates(found: PhotoI) -> Estimates:

@@ -22,7 +22,7 @@ from ..procedures.oscilloscope import PhotoII
 from ..refine import CAUSES, Causes, InstrumentFit, Rivalry
 from .factors import FACTORS, correctors, rods_of
 from .figures import distortion_figure, residual_figure
-from .overlay import Arcs, Marks, frame_overlay
+from .overlay import Arcs, frame_overlay, marks_of
 from .tables import (
     Estimates,
     Item,
@@ -169,12 +169,10 @@ def _overlay(found: PhotoII, frame: Frame) -> str:
     measured, fit = found.measured, found.instrument.fit
     check = () if fit is None else fit.check.names
     if measured is None:
-        names, xy = found.pins.names, found.pins.xy
-        return frame_overlay(frame, Marks(names, xy, np.ones(len(names), dtype=bool), check))
-    xy = np.where(measured.ok[:, None], measured.xy, measured.predicted)
+        return frame_overlay(frame, marks_of(found.pins, None, check))
     arcs = Arcs(measured.length, measured.curvature, measured.tilt)
     labels = {name: name for name in measured.ids}
-    return frame_overlay(frame, Marks(measured.ids, xy, measured.ok, check, arcs, labels))
+    return frame_overlay(frame, marks_of(found.pins, measured, check, arcs=arcs, labels=labels))
 
 
 def _setup(found: PhotoII) -> list[tuple[Markup, str, str]]:

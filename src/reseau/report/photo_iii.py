@@ -12,7 +12,7 @@ from ..core.numbers import aligned
 from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoIII
 from .maps import PROBABILITY, body_map
-from .overlay import Arcs, Marks, frame_overlay
+from .overlay import Arcs, Marks, frame_overlay, marks_of
 from .tables import Item, Row
 from .truth import BodyComparison
 
@@ -80,9 +80,8 @@ def _overlay(found: PhotoIII, frame: Frame) -> str:
     """Points with their names; bright rejected spots are crossed out."""
     measured = found.measured
     if measured is None:
-        names, xy = found.points.names, found.points.xy
-        shown = Marks(names, xy, np.ones(len(names), dtype=bool), labels={name: name for name in names})
-        return frame_overlay(frame, shown)
+        labels = {name: name for name in found.points.names}
+        return frame_overlay(frame, marks_of(found.points, None, labels=labels))
     points = measured.points
     show = measured.ok | (measured.strength >= _SHOWN_FROM)
     every = np.full(len(measured), "", dtype=object)

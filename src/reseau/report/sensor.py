@@ -10,7 +10,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from ..core.data import Array
 from ..core.failure import Failure
-from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, to_svg
+from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, label_axes, to_svg
 from ..core.provenance import Provenance
 from ..sensor import EdgeSpread, FreeCurve, Linearity
 from ..sensor.sensor import SensorResult
@@ -110,14 +110,6 @@ def _edge(edge: EdgeSpread) -> dict[str, object]:
     }
 
 
-def _axes(axes: Axes, title: str, x: str, y: str) -> None:
-    axes.set_title(title, loc="left")
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-
-
 def mtf_figure(edge: EdgeSpread) -> str:
     """Draw the free curve with its 95 % band, the Gaussian curve, and the line-spread functions.
 
@@ -140,8 +132,8 @@ def mtf_figure(edge: EdgeSpread) -> str:
             _spread(right, edge, edge.free)
         left.set(xlim=(0, 1), ylim=(0, 1.08))
         left.legend(frameon=False, fontsize=8.5, loc="upper right", bbox_to_anchor=(1.0, 0.94))
-        _axes(left, "modulation transfer", "cycles per pixel, along the normal", "")
-        _axes(right, "line-spread function", "distance from the edge / px", "share of the step per px")
+        label_axes(left, "modulation transfer", "cycles per pixel, along the normal", "")
+        label_axes(right, "line-spread function", "distance from the edge / px", "share of the step per px")
         return to_svg(figure)
 
 
@@ -193,6 +185,8 @@ def transfer_figure(result: SensorResult) -> str:
             straight = result.linearity.straight(curve.signal[part])[0]
             scale = float(straight @ amount[part]) / float(amount[part] @ amount[part])
             right.plot(linear / scale, signal, color=BLUE, lw=1.0, zorder=0)
-        _axes(left, "photon transfer", "signal / DN", "variance / DN²")
-        _axes(right, "response to light", "exposure / ms" if curve.light is None else "light", "signal / DN")
+        label_axes(left, "photon transfer", "signal / DN", "variance / DN²")
+        label_axes(
+            right, "response to light", "exposure / ms" if curve.light is None else "light", "signal / DN"
+        )
         return to_svg(figure)

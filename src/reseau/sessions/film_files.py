@@ -195,7 +195,7 @@ def _write(job: ScanJob, scan: Any, documents: list[FrameOrientation]) -> None:
     for i, document in enumerate(documents):
         stem = job.name if len(documents) == 1 else f"{job.name}-{i + 1}"
         document.write(job.out / f"{stem}.json")
-        write_whole(job.out / f"{stem}.csv", _csv(document))
+        write_whole(job.out / f"{stem}.csv", document.image_points().to_csv(".4f", ".4f", ".4f"))
         write_image(job.out / "provenance" / f"{stem}.png", frame_tile(scan, document))
         if job.cut and document.corners is not None:
             write_cut(job.out / f"{stem}-frame.tif", scan, document.image_points().xy)
@@ -213,14 +213,6 @@ def _provenance(job: ScanJob) -> dict[str, Any]:
         inputs["corners"] = sha256_of(job.corners)
     options = {"format_mm": job.format_mm, "dpi": job.dpi, "near": job.near, "transform": job.transform}
     return Provenance(inputs, options | {"marked": job.marked, "cut": job.cut}).to_dict()
-
-
-def _csv(document: FrameOrientation) -> str:
-    points = document.image_points()
-    lines = ["id,x,y,sx,sy,rho"]
-    for name, (x, y), (sx, sy), cov in zip(points.names, points.xy, points.sigma, points.cov, strict=True):
-        lines.append(f"{name},{x:.4f},{y:.4f},{sx:.4f},{sy:.4f},{cov[0, 1] / max(sx * sy, 1e-12):.4f}")
-    return "\n".join(lines) + "\n"
 
 
 def _earlier(job: ScanJob) -> ScanOutcome | None:

@@ -30,7 +30,7 @@ from itertools import product
 
 import numpy as np
 
-from ...calibration.camera import CameraMapping, by_rotation, places, referred
+from ...calibration.camera import CameraMapping, Rival, by_rotation, places, referred
 from ...core.data import Array, Mask, Rows
 from ...optics.cameras.registry import CameraModel
 from ..solver.problem import BundleFit
@@ -46,22 +46,6 @@ _RADIAL, _OWN, _NONE = 1e-3, 0.01, 1e-9
 not have, as each power has a quarter of what the one before has; size that is none, by the largest."""
 _PLACES, _SHARE = 400, 0.05
 """Image points at which models are compared; part of their difference that parameters need not describe."""
-
-
-@dataclass(frozen=True, eq=False)
-class Rival:
-    """A camera model of another kind than the chosen one, by what it predicts.
-
-    Parameters
-    ----------
-    probability : float
-        Probability that it is the right one.
-    lens : CameraMapping
-        The camera with this model.
-    """
-
-    probability: float
-    lens: CameraMapping
 
 
 @dataclass(frozen=True, eq=False)

@@ -185,11 +185,15 @@ class Scores:
     def log_profile(self, sizes: Array) -> Array:
         """Logarithm of the restricted likelihood with effects of these sizes, of the best variance factor."""
         values, squares = self._spectrum
-        lam, r = sizes[:, None] ** 2, self.redundancy
+        lam = sizes[:, None] ** 2
         quad = self.square - (lam * squares / (1 + lam * values)).sum(axis=1)
-        log_det = np.log1p(lam * values).sum(axis=1)
-        found: Array = -0.5 * (r * np.log(np.maximum(quad, 1e-300) / r) + log_det) + self.log_density
-        return found
+        return np.asarray(self.log_likelihood(quad) - 0.5 * np.log1p(lam * values).sum(axis=1))
+
+    def log_likelihood(self, square: Array) -> Array:
+        """The same for sums of squares, but for the determinant; none of those without any digits."""
+        known = square > 0
+        log = np.log(np.where(known, square, 1.0) / self.redundancy)
+        return np.asarray(np.where(known, self.log_density - 0.5 * self.redundancy * log, -np.inf))
 
     def best_size(self, sizes: Array = _SIZES) -> float:
         """The most probable size of the effects."""
@@ -227,7 +231,7 @@ class Scores:
             self,
             g=self.g - cross @ solved[:, 0],
             m=m - cross @ solved[:, 1:],
-            square=max(self.square - float(side[:, 0] @ solved[:, 0]), 1e-300),
+            square=self.square - float(side[:, 0] @ solved[:, 0]),
             carried=self.carried - (self.carried[:, columns] * sizes) @ solved[:, 1:],
             log_density=self.log_density - float(np.log(np.diag(factor[0])).sum()),
         )

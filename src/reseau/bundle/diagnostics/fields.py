@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...calibration.camera import CameraMapping, ProjectionField, by_rotation, places, reach
+from ...calibration.camera import CameraMapping, ProjectionField, Rival, by_rotation, places, reach
 from ...core.data import Array, Rows
 from ...core.errors import UsageError
 from .checks import listed
@@ -43,6 +43,7 @@ def camera_mapping(
     camera = result.network.cameras[c]
     names, columns, values = own_columns(result, c, additional)
     found = camera.parameters | dict(zip(names, values.tolist(), strict=True))
+    rivals = tuple[Rival, ...]()
     if formal:
         covariance = result.fit.cofactors.reduced.block(columns, columns) * result.fit.variance
         degrees = float("inf")
@@ -50,8 +51,9 @@ def camera_mapping(
         uncertain = result.uncertainty(columns)
         degrees = uncertain.degrees
         names, covariance, _ = result.with_considered(c, names, columns, uncertain.covariance)
-    size = (camera.width, camera.height)
-    return CameraMapping.of_estimates(camera.plane_mapping(), size, found, names, covariance, dof=degrees)
+        rivals = result.rivals_of(c)
+    size, plane = (camera.width, camera.height), camera.plane_mapping()
+    return CameraMapping.of_estimates(plane, size, found, names, covariance, dof=degrees, rivals=rivals)
 
 
 def own_columns(result: Result, c: int, additional: str | None) -> tuple[tuple[str, ...], Rows, Array]:

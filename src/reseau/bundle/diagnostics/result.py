@@ -13,6 +13,7 @@ import scipy
 from ...adjust.components import VarianceComponents
 from ...adjust.outliers import SnoopingStep
 from ...adjust.significance import CoefficientTest, GlobalTest, ratio_test
+from ...calibration.camera import Rival
 from ...core.data import Array, Mask, Rows
 from ...core.display import Display, Table
 from ...core.errors import UsageError
@@ -24,7 +25,7 @@ from ..network.network import Network
 from ..network.stage import perpendicular
 from ..solver.problem import BundleFit
 from ..solver.rank import missing_windows
-from .considered import Considered, Rival, considered
+from .considered import Considered, considered
 from .estimates import (
     CameraEstimate,
     ImageEstimates,
@@ -156,8 +157,8 @@ class Result(Estimated, Display):
     @property
     def _gross_part(self) -> float:
         """Part of what vᵀPv is too large that single image points have, more each than by chance."""
-        v = np.nan_to_num(self.residuals[self._kept])
-        square = np.einsum("ni,nij,nj->n", v, np.linalg.inv(self.network.cov[self._kept]), v)
+        v = np.nan_to_num(self.residuals[self.used])
+        square = np.einsum("ni,nij,nj->n", v, np.linalg.inv(self.network.cov[self.used]), v)
         gross = square > scipy.special.chdtri(2, 0.01 / max(len(square), 1))
         return float(square[gross].sum() / max(self.fit.cost - self.redundancy, 1e-300))
 
@@ -202,10 +203,10 @@ class Result(Estimated, Display):
         camera : int
             Number of the camera.
         """
-        from ...core.figures import ACCENT, FAINT, image_axes, new_axes, nice
+        from ...core.figures import ACCENT, FAINT, draw_arrows, image_axes, new_axes, nice
 
         network, entry = self.network, self.network.cameras[camera]
-        rows = np.flatnonzero(self._kept & self._of_camera(camera))
+        rows = self.used_by(camera)
         xy, v = network.xy[rows], self.residuals[rows]
         axes = new_axes(axes)
         axes.plot(*xy.T, ".", color=FAINT, markersize=1.5)
@@ -213,15 +214,7 @@ class Result(Estimated, Display):
         typical = float(np.quantile(size, 0.9)) if len(size) else 0.0
         enlarged = nice(0.03 * entry.width / typical) if typical > 0 else 1.0
         shown = slice(None, None, max(1, len(xy) // 3000))
-        axes.quiver(
-            *xy[shown].T,
-            *(enlarged * v[shown]).T,
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            color=ACCENT,
-            width=0.002,
-        )
+        draw_arrows(axes, xy[shown], enlarged * v[shown], ACCENT, 0.002)
         image_axes(
             axes, entry.width, entry.height, f"residuals × {enlarged:g}, rms {self.rms_px(camera):.2g} px"
         )
@@ -284,6 +277,10 @@ class Result(Estimated, Display):
         found = self._shared_uncertainty(columns)
         more = [each.errors(columns)[: len(columns), : len(columns)] for each in self._considered.values()]
         return found if not more else found.with_errors(np.sum(more, axis=0))
+
+    def rivals_of(self, c: int) -> tuple[Rival, ...]:
+        """Models of other kinds that a camera may have."""
+        return self.rivals[c] if self.rivals else ()
 
     def with_considered(
         self, c: int, names: tuple[str, ...], columns: Rows, covariance: Array
@@ -657,22 +654,25 @@ class Result(Estimated, Display):
         The figure of OpenCV is that of the distances, larger by the root of 2. `camera` is the row of one
         camera; by default all.
         """
-        v = self.residuals[self._kept if camera is None else self._kept & self._of_camera(camera)]
+        v = self.residuals[self.used if camera is None else self.used_by(camera)]
         return float(np.sqrt((v**2).mean())) if len(v) else float("nan")
 
     @property
-    def _kept(self) -> Mask:
+    def used(self) -> Mask:
         """Image points (n,) that were adjusted."""
-        return np.asarray(np.isfinite(self.residuals).all(axis=1) & ~self.rejected)
+        known = np.isfinite(self.residuals).all(axis=1)
+        return np.asarray(self.fit.usable.observations & known & ~self.rejected)
 
-    def _of_camera(self, camera: int) -> Mask:
-        return np.asarray(self.network.camera_of[self.network.image_of] == camera)
+    def used_by(self, camera: int) -> Rows:
+        """Return the rows of the image points of a camera that were adjusted."""
+        rows = self.network.rays_of_cameras[camera]
+        return rows[self.used[rows]]
 
     def residuals_by_image(self) -> Table:
         """Residuals of each image: its camera, points, those left out, root mean square and largest, px."""
         network, rows = self.network, self.network.image_of
-        count = np.bincount(rows[self._kept], minlength=len(network.images))
-        squares = np.where(self._kept[:, None], np.nan_to_num(self.residuals) ** 2, 0.0).sum(axis=1)
+        count = np.bincount(rows[self.used], minlength=len(network.images))
+        squares = np.where(self.used[:, None], np.nan_to_num(self.residuals) ** 2, 0.0).sum(axis=1)
         largest = np.zeros(len(network.images))
         np.maximum.at(largest, rows, np.sqrt(squares))
         total = np.bincount(rows, squares, len(network.images))
@@ -718,7 +718,7 @@ class Result(Estimated, Display):
         """
         cov = self.network.cov
         variance = np.diagonal(cov, axis1=1, axis2=2)
-        kept = (self.fit.usable.observations & ~self.rejected)[:, None]
+        kept = self.used[:, None]
         hat = next(iter(self.fit.solution.hats()))
         left = np.diagonal(cov - cov @ hat @ cov, axis1=1, axis2=2) / variance
         squares = np.nan_to_num(self.residuals) ** 2 / variance

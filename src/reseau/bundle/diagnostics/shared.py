@@ -302,7 +302,7 @@ def shared_errors(fit: BundleFit) -> SharedErrors | None:
     # Each component pays for itself as a parameter with as many observations as it has groups (Schwarz 1978).
     price = 0.5 * np.log([effect.groups for effect in some])
     log = np.array([log - price @ (sizes > 0) for sizes, log, *_ in fits])
-    nothing = -0.5 * every.redundancy * np.log(every.square / every.redundancy)
+    nothing = float(every.log_likelihood(np.array(every.square)))
     weights = np.exp(log - max(float(log.max()), nothing))
     weights /= weights.sum() + len(weights) * np.exp(nothing - max(float(log.max()), nothing))
     best, _, joint, _ = fits[int(np.argmax(log))]
@@ -390,14 +390,13 @@ def _along(scores: Scores, near: float) -> tuple[float, float]:
     """Size of the largest likelihood: on a coarse grid, then by parabolas on a logarithmic scale."""
 
     def log_of(x: float) -> float:
-        size, r = float(np.exp(x)), scores.redundancy
+        size = float(np.exp(x))
         factor = lower_factor(size**2 * scores.m)
         half = scipy.linalg.solve_triangular(factor, size * scores.g, lower=True, check_finite=False)
-        square = max(scores.square - float(half @ half), 1e-300)
-        log_det = float(np.log(np.diag(factor)).sum())
-        return float(-0.5 * r * np.log(square / r) - log_det + scores.log_density)
+        square = scores.square - float(half @ half)
+        return float(scores.log_likelihood(np.array(square)) - np.log(np.diag(factor)).sum())
 
-    nothing = -0.5 * scores.redundancy * np.log(scores.square / scores.redundancy) + scores.log_density
+    nothing = float(scores.log_likelihood(np.array(scores.square)))
     grid = np.log(_GRID) if not near else np.log(near) + np.log(2.0) * np.arange(-1, 2)
     values = [log_of(float(x)) for x in grid]
     k = int(np.argmax(values))
@@ -408,7 +407,7 @@ def _along(scores: Scores, near: float) -> tuple[float, float]:
         bend = left - 2 * y + right
         move = (
             float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) * step
-            if bend < 0
+            if -np.inf < bend < 0
             else (step if right > left else -step)
         )
         new = log_of(x + move)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...core.data import Array, Mask, Rows
 from ...optics.mapping import PlaneMapping
+from ...optics.poses import cross_matrix
 from ..diagnostics.evidence import Effect, in_camera, places_seen, sigma_seen, used_rows
 from ..diagnostics.fields import camera_mapping
 from ..diagnostics.image_effects import creases, smooth_effects
@@ -144,21 +145,13 @@ class Sight:
         count = np.bincount(self.image, minlength=len(self.network.images))
         sums = [np.bincount(self.image, axis, len(count)) for axis in self.in_camera.T]
         middle: Array = np.stack(sums, axis=1) / np.maximum(count, 1)[:, None]
-        cross = _cross(self.in_camera - middle[self.image])
+        cross = -cross_matrix(self.in_camera - middle[self.image])
         return np.concatenate([self.by_place @ cross, self.by_place], axis=2)
 
     @cached_property
     def by_point(self) -> Array:
         """Derivatives of pixels by object coordinates (n, 2, 3)."""
         return self.by_place @ self.result.fit.values.rotation[self.image]
-
-
-def _cross(at: Array) -> Array:
-    """Derivatives (n, 3, 3) of places (n, 3) by a small rotation about the origin."""
-    x, y, z = at.T
-    zero = np.zeros_like(x)
-    rows = [np.stack([zero, z, -y]), np.stack([-z, zero, x]), np.stack([y, -x, zero])]
-    return np.stack(rows).transpose(2, 0, 1)
 
 
 def families(sight: Sight, only: str = "") -> Iterator[Family]:
@@ -271,7 +264,7 @@ def _rolling(sight: Sight) -> Iterator[Family]:
     height = np.array([camera.height for camera in network.cameras])[sight.camera]
     time = sight.xy[:, 1] / height - 0.5
     # Rotations about the camera: it is held by hand.
-    turned = sight.by_place @ _cross(sight.in_camera)
+    turned = -sight.by_place @ cross_matrix(sight.in_camera)
     slope = np.concatenate([turned, sight.by_place], axis=2) * time[:, None, None]
     effect = Effect(slope, sight.image, len(network.images))
     forms = {"all": np.arange(6), "turn": np.arange(3), "shift": np.arange(3, 6)}

@@ -18,6 +18,7 @@ from ...core.data import Array
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Estimated, Failure
+from ...core.numbers import or_null
 from ..diagnostics.result import Result
 from ..network.network import Network
 from ..solver.problem import BundleFit, BundleProblem
@@ -101,17 +102,14 @@ class BoardChoice(Estimated, Display):
     def entries(self) -> dict[str, Any]:
         """Return the comparison as JSON values for the calibration document; unknown numbers are null."""
 
-        def number(value: float) -> float | None:
-            return value if np.isfinite(value) else None
-
         return {
             "chosen": self.chosen.name,
             "models": [
                 {
-                    "name": each.name, "parameters": each.parameters, "sigma0": number(each.sigma0),
-                    "length": number(each.length), "p": number(each.p),
-                    "warp": [number(float(v)) for v in each.warp],
-                    "warp_sigma": [number(float(v)) for v in each.warp_sigma],
+                    "name": each.name, "parameters": each.parameters, "sigma0": or_null(each.sigma0),
+                    "length": or_null(each.length), "p": or_null(each.p),
+                    "warp": [or_null(v) for v in each.warp],
+                    "warp_sigma": [or_null(v) for v in each.warp_sigma],
                 }
                 for each in self.models
             ],
@@ -175,7 +173,7 @@ def choose_board(network: Network, options: Options | None = None) -> BoardChoic
     if isinstance(result, Failure):
         return result
     free, n = result.fit, len(network.xy)
-    seen = free.usable.observations & ~result.rejected
+    seen = result.used
     held = held_as_designed(network)
     start = replace(free.problem, network=held, start=free.values, rounds=0)
     weights = np.zeros(len(start.observations))

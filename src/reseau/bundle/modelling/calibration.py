@@ -70,8 +70,7 @@ def calibration_of(
         for key, value in (entry.parameters | dict(zip(names, values.tolist(), strict=True))).items()
     }
     dof = {"degrees_of_freedom": uncertain.degrees} if np.isfinite(uncertain.degrees) else {}
-    used = result.fit.usable.observations & ~result.rejected
-    xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
+    xy = result.network.xy[result.used_by(c)]
     targets = covariance_by_targets(result, c)
     targets = None if targets is None else np.pad(targets, (0, len(every) - len(names)))
     parts = {
@@ -80,10 +79,11 @@ def calibration_of(
     }  # fmt: skip
     # Coefficients that were held have no formal sigma.
     formal = dict.fromkeys(every, 0.0) | dict(zip(names, found.sigma_formal.tolist(), strict=True))
+    rivals = {"rivals": [each.entry() for each in result.rivals_of(c)]} if result.rivals_of(c) else {}
     return Calibration(
         kind="camera",
         name=name,
-        model=_model(entry),
+        model=model_entry(entry),
         parameters=parameters,
         covariance=Covariance(names=every, matrix=tuple(tuple(row) for row in covariance.tolist())),
         sigma0=result.sigma0 if result.redundancy > 0 else None,
@@ -95,7 +95,7 @@ def calibration_of(
                   "images": int(np.count_nonzero(result.fit.usable.images & (result.network.camera_of == c))),
                   **parts, "rms_px": result.rms_px(c),
                   "warnings": [remark.text for remark in result.warnings],
-                  "warning_codes": [remark.code.value for remark in result.warnings]},
+                  "warning_codes": [remark.code.value for remark in result.warnings], **rivals},
         provenance=dict(provenance or {}),
         times=dict(times or {}),
     )  # fmt: skip
@@ -116,8 +116,8 @@ def _place(result: Result, camera: str) -> Place | None:
     )
 
 
-def _model(camera: Camera) -> CameraModel:
-    """Return the model entry of the calibration."""
+def model_entry(camera: Camera) -> CameraModel:
+    """Return the model as in a calibration."""
     model: CameraModel = {
         "model": camera.model,
         "width": camera.width,

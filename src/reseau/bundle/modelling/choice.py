@@ -19,20 +19,21 @@ import numpy as np
 import scipy
 
 from ...calibration import CameraMapping, calibration_difference
-from ...calibration.camera import projection_field
+from ...calibration.camera import Rival, projection_field
 from ...core.data import Array, Rows
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Code, Estimated, Failure
+from ...core.numbers import or_null
 from ...optics.cameras.registry import camera_model
 from ..diagnostics.checks import unmodelled_pattern
-from ..diagnostics.considered import Rival
 from ..diagnostics.evidence import ODDS
 from ..diagnostics.views import views_of
 from ..network.camera import Camera
 from ..network.network import Network
 from ..solver.problem import BundleFit
 from .adjustment import Options, adjust_network
+from .calibration import model_entry
 from .candidates import (
     PARALLEL,
     SERIES,
@@ -145,23 +146,20 @@ class ModelChoice(Estimated, Display):
     def entries(self) -> list[dict[str, Any]]:
         """Return the comparison as JSON values for the calibration document; unknown numbers are null."""
 
-        def number(value: float) -> float | None:
-            return value if np.isfinite(value) else None
-
         return [
             {
                 "model": each.candidate.model,
                 "free": list(each.candidate.free),
                 "additional": each.candidate.additional,
                 "reason": each.reason,
-                "sigma0": number(each.sigma0),
-                "length": number(each.length),
-                "predicted": number(each.predicted),
-                "p": number(each.p),
-                "rms_px": number(each.rms_px),
-                "corner_px": number(each.corner_px),
-                "corner_sigma_px": number(each.corner_sigma_px),
-                "significant_share": number(each.share),
+                "sigma0": or_null(each.sigma0),
+                "length": or_null(each.length),
+                "predicted": or_null(each.predicted),
+                "p": or_null(each.p),
+                "rms_px": or_null(each.rms_px),
+                "corner_px": or_null(each.corner_px),
+                "corner_sigma_px": or_null(each.corner_sigma_px),
+                "significant_share": or_null(each.share),
             }
             for each in self.compared
         ]
@@ -613,7 +611,7 @@ class _Search:
         often = images * np.random.default_rng(0).dirichlet(np.ones(images), _DRAWS)
         probability = scipy.special.softmax(often @ each_image.T, axis=1).mean(axis=0)
         return tuple(
-            Rival(float(p), self._mapping(each, found[each]))
+            Rival(float(p), self._mapping(each, found[each]), self._entry(each))
             for each, p in zip(kinds, probability, strict=True)
             if p > _NOTHING and not each.alike(self.pick)
         )
@@ -659,6 +657,13 @@ class _Search:
             model.mapping(values, given.grid, own.options), given.width, given.height, at,
             one.covariance[np.ix_(at, at)],
         )  # fmt: skip
+
+    def _entry(self, own: Candidate) -> dict[str, Any]:
+        """The model as in a calibration."""
+        camera = self._nearest(own).fit.problem.network.cameras[self.camera]
+        if own.additional is None:
+            camera = replace(camera, additional=None)
+        return {**model_entry(camera), "model": own.model, **own.options}
 
     def _difference(self, own: Candidate, one: Prediction, chosen: Prediction) -> dict[str, float]:
         """Difference of a camera from the chosen one over the image, and what it means."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, Self, cast
 
@@ -295,21 +295,38 @@ class Camera:
         return extra.per == "camera" and model.combine(self.bare_mapping(), extra.mapping()) is not None
 
     @classmethod
+    def of(
+        cls, name: str, size: Sequence[int], model: str, values: Mapping[str, float],
+        free: Container[str] = (), *, pitch_mm: tuple[float, float] = (1.0, 1.0),
+        options: Mapping[str, str | float] | None = None,
+    ) -> Self:  # fmt: skip
+        """Create a camera from values by name; those that are missing are zero.
+
+        Examples
+        --------
+        >>> camera = Camera.of("front", (640, 480), "opencv", {"fx": 800.0, "fy": 800.0, "k1": 0.1}, ("fx",))
+        >>> camera.parameters["k1"], camera.parameters["k2"], camera.free
+        (0.1, 0.0, ('fx',))
+        """
+        registered = camera_model(model)
+        return cls(
+            name, size[0], size[1], pitch_mm, model, registered.column(values),
+            tuple(each for each in registered.names if each in free), options or {},
+        )  # fmt: skip
+
+    @classmethod
     def from_entry(cls, entry: CameraEntry) -> Self:
         """Create the camera of an entry in ``reseau-network/1``.
 
         Missing parameters are zero; those that the model regularises are observed.
         """
         model, extra = camera_model(entry.model), entry.additional
-        return cls(
-            id=entry.id,
-            width=entry.width,
-            height=entry.height,
-            pitch_mm=entry.pitch_mm or (1.0, 1.0),
-            model=entry.model,
-            values=np.array([entry.parameters.get(name, 0.0) for name in model.names]),
-            free=tuple(name for name in model.names if name in entry.free),
-            options=entry.options,
+        plain = cls.of(
+            entry.id, (entry.width, entry.height), entry.model, entry.parameters, entry.free,
+            pitch_mm=entry.pitch_mm or (1.0, 1.0), options=entry.options,
+        )  # fmt: skip
+        return replace(
+            plain,
             sigma=model.priors(entry.free) | dict(entry.sigma or {}),
             additional=None
             if extra is None

@@ -9,7 +9,7 @@ from typing import Literal, Self
 
 import numpy as np
 
-from ...core.data import Array, Mask, Rows, rows_of_groups
+from ...core.data import Array, Mask, Rows, covariances_of, rows_of_groups
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Network1
@@ -275,11 +275,6 @@ class Network(Display):
         camera_row = {camera.id: i for i, camera in enumerate(cameras)}
         point_row = {name: i for i, name in enumerate(points.id)}
         image_row = {name: i for i, name in enumerate(images.id)}
-        sx, sy = np.array(seen.sx, dtype=np.float64), np.array(seen.sy, dtype=np.float64)
-        cov = np.zeros((len(sx), 2, 2))
-        cov[:, 0, 0], cov[:, 1, 1] = sx**2, sy**2
-        if seen.rho is not None:
-            cov[:, 0, 1] = cov[:, 1, 0] = np.array(seen.rho) * sx * sy
         bars = document.distances
         ends = [] if bars is None else [bars.from_, bars.to]
         datum = np.ones(len(points.id), dtype=bool)
@@ -298,7 +293,7 @@ class Network(Display):
             image_of=_rows(seen.image, image_row),
             point_of=_rows(seen.point, point_row),
             xy=np.array([seen.x, seen.y], dtype=np.float64).T.reshape(-1, 2),
-            cov=cov,
+            cov=covariances_of(seen.sx, seen.sy, seen.rho or 0.0),
             distance_of=np.array([_rows(end, point_row) for end in ends], dtype=np.intp).T.reshape(-1, 2),
             distance=np.array([] if bars is None else [bars.length, bars.sigma], dtype=np.float64)
             .T.reshape(-1, 2),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.data import sigmas_of
 from ...core.errors import UsageError
 from ...io.network import (
     AdditionalParameters,
@@ -211,8 +212,6 @@ def network_document(network: Network) -> Network1:
     if network.refraction is not None:
         raise UsageError("a network with windows cannot be written", where="network")
     ids = [camera.id for camera in network.cameras]
-    sx, sy = np.sqrt(network.cov[:, 0, 0]), np.sqrt(network.cov[:, 1, 1])
-    rho = network.cov[:, 0, 1] / (sx * sy)
     points = np.array(network.points, dtype=object)
     bars = network.distance
     a, b = network.distance_of.T
@@ -239,15 +238,7 @@ def network_document(network: Network) -> Network1:
             ),
             role=network.role,  # type: ignore[arg-type]
         ),
-        observations=ObservationColumns(
-            image=tuple(network.images[i] for i in network.image_of),
-            point=tuple(network.points[j] for j in network.point_of),
-            x=tuple(network.xy[:, 0].tolist()),
-            y=tuple(network.xy[:, 1].tolist()),
-            sx=tuple(sx.tolist()),
-            sy=tuple(sy.tolist()),
-            rho=tuple(rho.tolist()) if (rho != 0).any() else None,
-        ),
+        observations=observation_columns(network),
         distances=DistanceColumns(
             **{"from": tuple(points[a])}, to=tuple(points[b]), length=tuple(bars[:, 0].tolist()),
             sigma=tuple(bars[:, 1].tolist()),
@@ -256,6 +247,23 @@ def network_document(network: Network) -> Network1:
         turntable=None if network.stage is None else turntable_of_stage(network.stage, network.images),
         datum=network.datum,
         datum_points=tuple(points[network.datum_points]) if network.datum_chosen else None,
+    )  # fmt: skip
+
+
+def observation_columns(network: Network) -> ObservationColumns:
+    """Return the image coordinates of a network as its document has them.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> observation_columns(example_network()).x[0] == example_network().xy[0, 0]
+    np.True_
+    """
+    x, y, sx, sy, rho = np.column_stack([network.xy, *sigmas_of(network.cov)]).T.tolist()
+    return ObservationColumns(
+        image=tuple(network.images[i] for i in network.image_of),
+        point=tuple(network.points[j] for j in network.point_of),
+        x=tuple(x), y=tuple(y), sx=tuple(sx), sy=tuple(sy), rho=tuple(rho) if any(rho) else None,
     )  # fmt: skip
 
 

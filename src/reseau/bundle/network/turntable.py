@@ -8,6 +8,7 @@ import numpy as np
 
 from ...core.data import Array
 from ...core.errors import UsageError
+from ...core.numbers import or_null
 from ...io.network import TurntableEntry
 from .stage import Stage
 
@@ -86,15 +87,15 @@ def turntable_of_stage(stage: Stage, images: Sequence[str]) -> TurntableEntry:
     on = np.flatnonzero(stage.pose >= 0).tolist()
 
     def column(values: Array) -> tuple[float | None, ...]:
-        return tuple(float(v) if np.isfinite(v) else None for v in np.degrees(values[on]))
+        return tuple(or_null(v) for v in np.degrees(values[on]))
 
     return TurntableEntry(
         carries=stage.carries, image=tuple(images[i] for i in on), angle_deg=column(stage.reading),
         sigma_deg=column(np.asarray(stage.sigmas)), pose=tuple(str(p) for p in stage.pose[on].tolist()),
         direction=None if stage.axis is None else _triple(stage.axis),
-        direction_sigma_deg=float(np.degrees(stage.axis_sigma)) if np.isfinite(stage.axis_sigma) else None,
+        direction_sigma_deg=or_null(np.degrees(stage.axis_sigma)),
         position=None if stage.point is None else _triple(stage.point),
-        position_sigma=stage.point_sigma if np.isfinite(stage.point_sigma) else None,
+        position_sigma=or_null(stage.point_sigma),
     )  # fmt: skip
 
 

@@ -158,6 +158,14 @@ def full(band: Array, border: Array) -> Array:
     return lower + np.tril(lower, -1).T
 
 
+def add(band: Array, border: Array, matrix: scipy.sparse.csr_array) -> None:
+    """Add a symmetric matrix (u, u), whose entries are inside the band or in full rows; lower triangles."""
+    low = scipy.sparse.tril(matrix).tocoo()
+    inside = low.row < len(band)
+    band[low.col[inside], (low.row - low.col)[inside]] += low.data[inside]
+    border[low.row[~inside] - len(band), low.col[~inside]] += low.data[~inside]
+
+
 def _forward(lower: Array, sides: Array) -> Array:
     """L⁻¹ times right-hand sides, L a band."""
     solved: Array = scipy.linalg.lapack.dtbtrs(lower.T, _columns(sides), uplo="L", trans="N")[0]

@@ -10,14 +10,13 @@ for y. Damping remains that of the parameters themselves.
 
 from __future__ import annotations
 
-from collections.abc import Set
+from collections.abc import Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from ...core.data import Array, Rows, rows_of_groups
-from .normal import Sums
 from .unknowns import Unknowns
 
 # Least eigenvalue of the normal equations of a camera with unit diagonal for which its parameters are used as
@@ -42,15 +41,24 @@ class CameraBasis(NamedTuple):
     turn: Array
     diagonal: Array
 
-    def damp(self, sums: Sums, damping: float) -> None:
-        """Add the damping of the parameters to the normal equations of the combinations."""
-        block = damping * (self.turn.T * self.diagonal) @ self.turn
-        bands, first = len(sums.band), int(self.columns[0])
-        if first >= bands:
-            sums.border[np.ix_(self.columns - bands, self.columns)] += block
-            return
-        for i, c in enumerate(self.columns):
-            sums.band[c, self.columns[i:] - c] += block[i:, i]
+
+def in_blocks(bases: Sequence[CameraBasis], blocks: Sequence[Array], others: Array) -> scipy.sparse.csr_array:
+    """A matrix (u, u) with a block (k, k) for each basis, and `others` (u,) on the rest of its diagonal."""
+    rest = np.ones(len(others), dtype=bool)
+    rest[[column for basis in bases for column in basis.columns]] = False
+    free = np.flatnonzero(rest)
+    parts = [(others[free], free, free)]
+    for basis, block in zip(bases, blocks, strict=True):
+        at = np.meshgrid(basis.columns, basis.columns, indexing="ij")
+        parts.append((block.ravel(), at[0].ravel(), at[1].ravel()))
+    values, rows, columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return scipy.sparse.csr_array((values, (rows, columns)), shape=(len(others), len(others)))
+
+
+def damping_of(bases: Sequence[CameraBasis], damping: float, diagonal: Array) -> scipy.sparse.csr_array:
+    """The damping (u, u) of the parameters, for the normal equations of the combinations."""
+    own = [damping * (basis.turn.T * basis.diagonal) @ basis.turn for basis in bases]
+    return in_blocks(bases, own, damping * np.where(diagonal > 0, diagonal, 1.0))
 
 
 def camera_bases(

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Mask, Rows
-from ...optics.poses import rotation_matrix
+from ...optics.poses import cross_matrix, rotation_matrix
 from ..network.network import Network
 from ..network.rig import Rig, RigValues
 from ..network.stage import StageValues
@@ -138,7 +138,7 @@ class RigConstraints:
         block[:, np.arange(6), np.arange(6)] = 1.0
         own = np.zeros((len(self.images), 6, 12))
         own[:, :3, :3] = places.rotation[camera]
-        own[:, 3:, :3] = back @ _cross(places.base[camera])
+        own[:, 3:, :3] = back @ cross_matrix(places.base[camera])
         own[:, np.arange(3, 6), np.arange(3, 6)] = 1.0
         own[:, np.arange(3), np.arange(6, 9)] = 1.0
         own[:, 3:, 9:] = back
@@ -230,13 +230,6 @@ class RigConstraints:
         back = np.linalg.pinv(t[rows][:, len(self.others) :])
         back = back[len(back) - 6 * count :]
         return np.asarray(back @ reduced[np.ix_(rows, rows)] @ back.T).reshape(count, 6, count, 6)
-
-
-def _cross(vectors: Array) -> Array:
-    """Matrices (n, 3, 3) of the vector product with vectors (n, 3)."""
-    x, y, z = vectors.T
-    none = np.zeros_like(x)
-    return np.stack([none, -z, y, z, none, -x, -y, x, none], axis=1).reshape(-1, 3, 3)
 
 
 class Constrained(NamedTuple):

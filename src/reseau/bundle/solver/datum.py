@@ -9,10 +9,10 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Mask, Rows
+from ...optics.poses import cross_matrix
 from ..network.camera import Camera
 from ..network.stage import perpendicular
 from .arrow import Singular
-from .stage_constraints import cross_matrix
 from .system import System
 from .unknowns import Unknowns
 from .values import Values
@@ -87,10 +87,7 @@ def _similarity_changes(
     def moved(x: Array) -> Array:
         d = np.zeros((*x.shape, 7))
         d[:, :, :3] = np.eye(3)
-        d[:, 0, 4], d[:, 0, 5] = x[:, 2], -x[:, 1]
-        d[:, 1, 5], d[:, 1, 3] = x[:, 0], -x[:, 2]
-        d[:, 2, 3], d[:, 2, 4] = x[:, 1], -x[:, 0]
-        d[:, :, 6] = x
+        d[:, :, 3:6], d[:, :, 6] = -cross_matrix(x), x
         return d
 
     reduced = np.zeros((unknowns.size, 7))
@@ -116,8 +113,8 @@ def _similarity_changes(
             reduced[unknowns.mount[c] + np.arange(3, 6), 6] = values.rig.base[c]
     points = moved(values.xyz)
     points[~taking_part] = 0.0
-    kept = np.flatnonzero(unknowns.kept >= 0)
-    reduced[unknowns.kept[kept, None] + np.arange(3)] = points[kept]
+    kept, columns = unknowns.kept_points
+    reduced[columns] = points[kept]
     points[kept] = 0.0
     return reduced, points
 
@@ -149,8 +146,8 @@ def freedom_of(system: System, values: Values, taking_part: Mask, *, windows: bo
     moving = _changes_of_windows(system, values)
     reduced, points = _similarity_changes(unknowns, values, taking_part, moving)
     whole = points.copy()
-    kept = np.flatnonzero(unknowns.kept >= 0)
-    whole[kept] = reduced[unknowns.kept[kept, None] + np.arange(3)]
+    kept, columns = unknowns.kept_points
+    whole[kept] = reduced[columns]
     counted = np.zeros(network.sigma.shape, dtype=bool)
     at = system.others.slices[1]
     j, axis = system.others.coordinate[system.sigma_root[at] > 0].T

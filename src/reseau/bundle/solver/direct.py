@@ -6,8 +6,8 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Mask, Rows
-from .arrow import Arrow, full
-from .camera_basis import CameraBasis
+from .arrow import Arrow, add, full
+from .camera_basis import CameraBasis, damping_of, in_blocks
 from .conjugate import Conjugate
 from .constraints import Constrained
 from .linear import Linear
@@ -68,18 +68,8 @@ class Normal:
         """Reduced unknowns (u, u) from the combinations for which these are formed; None for themselves."""
         if not self.bases:
             return None
-        u = self.linear.system.unknowns.size
-        own = np.ones(u)
-        parts = []
-        for basis in self.bases:
-            own[basis.columns] = 0.0
-            at = np.meshgrid(basis.columns, basis.columns, indexing="ij")
-            parts.append((basis.turn.ravel(), at[0].ravel(), at[1].ravel()))
-        kept = np.flatnonzero(own)
-        values, rows, columns = (
-            np.concatenate(column) for column in zip(*parts, (own[kept], kept, kept), strict=True)
-        )
-        return scipy.sparse.csr_array((values, (rows, columns)), shape=(u, u))
+        turns = [basis.turn for basis in self.bases]
+        return in_blocks(self.bases, turns, np.ones(self.linear.system.unknowns.size))
 
     def correction(self, relative: float = 0.0, absolute: float = 0.0) -> Correction:
         """Solve for the correction.
@@ -134,16 +124,11 @@ class Normal:
         other = Linear(system, linear.values, linear.rows, misfits, other_misfits)
         side, gradient = other.prior[:, :, 1].copy(), np.zeros(system.unknowns.size)
         gradients(0, len(side), rows, misfits, pattern, side, gradient)
-        one, at, more, interior = system.prior_column
-        for row, column in zip([*one, *more], [*at, *interior], strict=True):
-            gradient[column] += system.sigma_root[row] * other_misfits[row]
-        for k, columns, slope in linear.slopes():
-            gradient[columns] += slope * other_misfits[k]
+        gradient += linear.other_rows.T @ other_misfits
         reduced = np.zeros((len(gradient), 1))
         reduce_sides(0, len(side), rows, pattern, self.inverse, side[:, :, None], reduced)
         held = system.held.copy()
-        kept = np.flatnonzero(system.unknowns.kept >= 0)
-        held[(system.unknowns.kept[kept, None] + np.arange(3))[system.movable[kept] == 0]] = True
+        held[system.still] = True
         factors = self.factorise() if self.factors is None else self.factors
         y = self._solved(factors, np.where(held, 0.0, -(gradient + reduced[:, 0])))
         y = self.in_parameters(y)
@@ -199,16 +184,10 @@ def formed(linear: Linear, damping: float, *, turned: bool = True) -> Normal:
     )
     _add_others(linear, sums)
     sums.reduced[:] += sums.gradient
-    for column in np.flatnonzero(system.held):
+    for column in (*np.flatnonzero(system.held), *system.still):
         _hold(sums, int(column))
     if damping:
-        extra = damping * np.where(sums.diagonal > 0, sums.diagonal, 1.0)
-        for basis in bases:
-            extra[basis.columns] = 0.0
-            basis.damp(sums, damping)
-        sums.band[:, 0] += extra[:bands]
-        corner = np.arange(u - bands)
-        sums.border[corner, bands + corner] += extra[bands:]
+        add(sums.band, sums.border, damping_of(bases, damping, sums.diagonal))
     for basis in bases:
         sums.diagonal[basis.columns] = basis.diagonal
     return Normal(linear, sums, inverse, side, diagonal, damping, least, bases)
@@ -254,6 +233,8 @@ def _through(linear: Linear, damping: float) -> Normal:
     sums, inverse, side, points, least = _assembled(linear, linear.rows_through, pattern, damping, size, 0, 0)
     _add_others(linear, sums, to)
     sums.reduced[:] += sums.gradient
+    for column in to[system.still]:
+        _hold(sums, int(column))
     # The damping is that of poses, as without a rig.
     diagonal = np.zeros(unknowns.size)
     known = to >= 0
@@ -274,38 +255,14 @@ def _add_others(linear: Linear, sums: Sums, to: Rows | None = None) -> None:
 
     `to` (u,) are new numbers of these unknowns, where they have been renumbered.
     """
-    system = linear.system
-    bands, kept = len(sums.band), system.unknowns.kept
-    if to is None:
-        to = np.arange(system.unknowns.size)
-    rows, columns, rows_interior, columns_interior = system.prior_column
-    for row, column in zip([*rows, *rows_interior], [*columns, *columns_interior], strict=True):
-        column = to[column]
-        _add(sums, int(column), system.sigma_root[row], float(linear.other_misfits[row]), bands)
-    for k, column, slope in linear.slopes():
-        column = to[column]
-        gradient = slope * linear.other_misfits[k]
-        sums.gradient[column] += gradient
-        sums.diagonal[column] += slope**2
-        if column[0] >= bands:
-            sums.border[np.ix_(column - bands, column)] += np.outer(slope, slope)
-        else:
-            # All columns of a camera with a single image are in the band.
-            for i, c in enumerate(column):
-                sums.band[c, column[i:] - c] += slope[i] * slope[i:]
-    held = np.flatnonzero(kept >= 0)
-    for j in held:
-        for axis in np.flatnonzero(system.movable[j] == 0):
-            _hold(sums, int(to[kept[j] + axis]))
-
-
-def _add(sums: Sums, column: int, root: float, misfit_: float, bands: int) -> None:
-    sums.gradient[column] += root * misfit_
-    sums.diagonal[column] += root**2
-    if column < bands:
-        sums.band[column, 0] += root**2
-    else:
-        sums.border[column - bands, column] += root**2
+    rows = linear.other_rows
+    if to is not None:
+        rows = scipy.sparse.csr_array(
+            (rows.data, to[rows.indices], rows.indptr), (rows.shape[0], len(sums.gradient))
+        )
+    sums.gradient[:] += rows.T @ linear.other_misfits
+    sums.diagonal[:] += rows.power(2).sum(axis=0)
+    add(sums.band, sums.border, rows.T @ rows)
 
 
 def _hold(sums: Sums, column: int) -> None:

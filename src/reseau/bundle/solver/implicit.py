@@ -6,6 +6,7 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Mask
+from .camera_basis import damping_of
 from .conjugate import Conjugate
 from .direct import Normal, formed
 from .linear import Linear
@@ -102,24 +103,13 @@ def _formed(linear: Linear, damping: float) -> Implicit:
     sums.gradient[:] += more.T @ linear.other_misfits
     sums.diagonal[:] += more.power(2).sum(axis=0)
     sums.reduced[:] += sums.gradient
-    held = system.held.copy()
-    kept = np.flatnonzero(unknowns.kept >= 0)
-    held[(unknowns.kept[kept, None] + np.arange(3))[system.movable[kept] == 0]] = True
-    damped = damping * np.where(sums.diagonal > 0, sums.diagonal, 1.0)
+    extra = (damping_of(bases, damping, sums.diagonal) + more.T @ more).tocsr()
     for basis in bases:
-        damped[basis.columns] = 0.0
         sums.diagonal[basis.columns] = basis.diagonal
-    added = [scipy.sparse.diags_array(damped).tocoo(), (more.T @ more).tocoo()]
-    if damping:
-        for basis in bases:
-            block = damping * (basis.turn.T * basis.diagonal) @ basis.turn
-            at = np.meshgrid(basis.columns, basis.columns, indexing="ij")
-            added.append(
-                scipy.sparse.coo_array((block.ravel(), (at[0].ravel(), at[1].ravel())), shape=(u, u))
-            )
-    for part in added:
-        blocks.add(own, part.row, part.col, part.data)
-    extra = sum((part.tocsr() for part in added[1:]), added[0].tocsr())
+    added = extra.tocoo()
+    blocks.add(own, added.row, added.col, added.data)
+    held = system.held.copy()
+    held[system.still] = True
     normal = Implicit(linear, sums, inverse, side, points, damping, float(least.min(initial=1.0)), bases)
     normal.near, normal.extra = own, extra
     normal.hold(held)

@@ -127,9 +127,8 @@ class Linear:
     def other_rows(self) -> scipy.sparse.csr_array:
         """Weighted derivatives of the other observations by the reduced unknowns (k, u)."""
         root = self.system.sigma_root
-        rows_kept, columns_kept, rows_interior, columns_interior = self.system.prior_column
-        row, column = [rows_kept, rows_interior], [columns_kept, columns_interior]
-        value = [root[rows_kept], root[rows_interior]]
+        rows, columns = self.system.prior_column
+        row, column, value = [rows], [columns], [root[rows]]
         for k, columns, slope in self.slopes():
             row.append(np.full(len(columns), k))
             column.append(columns)

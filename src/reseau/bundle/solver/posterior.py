@@ -366,9 +366,7 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
     normal = normal_of(linear, 0.0)
     diagonal = normal.sums.diagonal.copy()
     held = system.held.copy()
-    ends = np.flatnonzero(system.unknowns.kept >= 0)
-    still = system.unknowns.kept[ends, None] + np.arange(3)
-    held[still[system.movable[ends] == 0]] = True
+    held[system.still] = True
     if system.constraints is not None:
         inner = freedom if datum is not None and freedom.defect else None
         (z, points, seen, others), q = _constrained(
@@ -382,8 +380,7 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
             z, points, seen, others = _unknown(linear, normal, held, taking_part)
         else:
             z, points, seen, others = _marginal(linear, normal, held, taking_part)
-    kept = np.flatnonzero(system.unknowns.kept >= 0)
-    columns = system.unknowns.kept[kept, None] + np.arange(3)
+    kept, columns = system.unknowns.kept_points
     referral, stage = None, None
     if system.constraints is not None and system.constraints.stage is not None:
         stage = q[system.constraints.stage.own, system.constraints.stage.own]
@@ -554,8 +551,7 @@ def _complete(
     system = linear.system
     points *= system.movable[:, :, None] * system.movable[:, None, :]
     points[~taking_part] = 0.0
-    kept = np.flatnonzero(system.unknowns.kept >= 0)
-    columns = system.unknowns.kept[kept, None] + np.arange(3)
+    kept, columns = system.unknowns.kept_points
     points[kept] = z.blocks(columns)
     return z, points, seen, _others(linear, z, points)
 
@@ -567,7 +563,7 @@ def _others(linear: Linear, z: Reduced, points: Array) -> Array:
     j, axis = system.others.coordinate.T
     _, coordinates, _ = system.others.slices
     hats[coordinates] = points[j, axis, axis]
-    _, _, rows, columns = system.prior_column
+    rows, columns = system.prior_column
     hats[rows] = z.blocks(columns[:, None])[:, 0, 0]
     hats *= system.sigma_root**2
     for k, column, slope in linear.slopes():
@@ -592,8 +588,8 @@ def _chosen(normal: Normal, freedom: Freedom, chosen: Mask) -> tuple[Array, Arra
     unknowns = normal.linear.system.unknowns
     g = np.where(chosen[:, None, None], freedom.points, 0.0)
     g_reduced = np.zeros((unknowns.size, freedom.defect))
-    kept = np.flatnonzero((unknowns.kept >= 0) & chosen)
-    columns = unknowns.kept[kept, None] + np.arange(3)
+    kept, columns = unknowns.kept_points
+    columns = columns[chosen[kept]]
     g_reduced[columns] = freedom.reduced[columns]
     return g, g_reduced
 

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.data import Array, Mask, Rows
-from ...optics.poses import rotation_matrix
+from ...optics.poses import cross_matrix, rotation_matrix
 from ..network.stage import Stage, StageValues, perpendicular
 
 
@@ -258,8 +258,3 @@ class StageConstraints:
         at = self.pose[:, None] + np.arange(6)
         held[at[columns[self.rows]]] = True
         return held
-
-
-def cross_matrix(v: Array) -> Array:
-    """[v]×."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

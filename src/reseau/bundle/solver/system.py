@@ -159,11 +159,17 @@ class System:
         return self.unknowns.pattern_through(pose, place, to), to, rig.size
 
     @cached_property
-    def prior_column(self) -> tuple[Rows, Rows, Rows, Rows]:
-        """Columns of other observations of single reduced unknowns.
+    def still(self) -> Rows:
+        """Columns of held coordinates of points that are not eliminated."""
+        points, columns = self.unknowns.kept_points
+        return np.asarray(columns[self.movable[points] == 0], dtype=np.intp)
 
-        Rows and columns of observed coordinates of kept points, then rows and columns of observed interior
-        orientation, of observed parameters of windows and media, and of the motion of cameras.
+    @cached_property
+    def prior_column(self) -> tuple[Rows, Rows]:
+        """Rows and columns of other observations of single reduced unknowns.
+
+        These are observed coordinates of points that are not eliminated, interior orientation, parameters of
+        windows and media, and the motion of cameras.
         """
         unknowns, (_, coordinates, interior) = self.unknowns, self.others.slices
         kept = unknowns.kept[self.others.coordinate[:, 0]]
@@ -175,10 +181,9 @@ class System:
         image, component = self.others.motion.T
         moved = unknowns.motion[image] >= 0
         return (
-            coordinates.start + rows,
-            kept[rows] + self.others.coordinate[rows, 1],
             np.concatenate(
                 [
+                    coordinates.start + rows,
                     interior.start + np.flatnonzero(used),
                     windows.start + np.arange(len(bent)),
                     self.others.motions.start + np.flatnonzero(moved),
@@ -186,6 +191,7 @@ class System:
             ),
             np.concatenate(
                 [
+                    kept[rows] + self.others.coordinate[rows, 1],
                     (unknowns.camera[c] + np.array(place, dtype=np.intp))[used],
                     unknowns.refraction + np.searchsorted(unknowns.refracting, bent),
                     (unknowns.motion[image] + component)[moved],

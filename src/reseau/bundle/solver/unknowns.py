@@ -199,6 +199,12 @@ class Unknowns:
         return (self.pose[images] + 5).astype(np.intp)
 
     @cached_property
+    def kept_points(self) -> tuple[Rows, Rows]:
+        """Points (k,) that are not eliminated, and their columns (k, 3)."""
+        points = np.flatnonzero(self.kept >= 0).astype(np.intp)
+        return points, self.kept[points, None] + np.arange(3)
+
+    @cached_property
     def dropped(self) -> Mask:
         """Mask of the columns (u,) that are held.
 

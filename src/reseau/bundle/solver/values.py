@@ -158,8 +158,8 @@ class Values:
         for e in np.flatnonzero(unknowns.extra >= 0):
             count = unknowns.extra_count[e]
             extra[e, :count] += y[unknowns.extra[e] : unknowns.extra[e] + count]
-        kept = np.flatnonzero(unknowns.kept >= 0)
-        xyz[kept] += y[unknowns.kept[kept, None] + np.arange(3)]
+        kept, columns = unknowns.kept_points
+        xyz[kept] += y[columns]
         x0, stage, rig = self.x0 + pose[:, 3:], self.stage, self.rig
         if constraints is not None and step.independent is not None:
             at, own = constraints.stepped(self.placed, step.independent), constraints.images

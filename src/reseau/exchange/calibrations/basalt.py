@@ -13,17 +13,17 @@ from typing import Any, Final
 
 import numpy as np
 
+from ...bundle import Camera
 from ...core.errors import FormatError
-from .plain import RATIONAL, PlainCamera
+from .plain import CENTRE, FISHEYE, RATIONAL, given
 
-_CENTRE = ("fx", "fy", "cx", "cy")
 _TYPES: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
-    "pinhole": ("opencv", _CENTRE),
-    "pinhole-radtan8": ("opencv", (*_CENTRE, *RATIONAL)),
-    "kb4": ("fisheye", (*_CENTRE, "k1", "k2", "k3", "k4")),
-    "ds": ("double_sphere", (*_CENTRE, "xi", "alpha")),
-    "eucm": ("eucm", (*_CENTRE, "alpha", "beta")),
-    "ucm": ("eucm", (*_CENTRE, "alpha")),
+    "pinhole": ("opencv", CENTRE),
+    "pinhole-radtan8": ("opencv", (*CENTRE, *RATIONAL)),
+    "kb4": ("fisheye", (*CENTRE, *FISHEYE)),
+    "ds": ("double_sphere", (*CENTRE, "xi", "alpha")),
+    "eucm": ("eucm", (*CENTRE, "alpha", "beta")),
+    "ucm": ("eucm", (*CENTRE, "alpha")),
 }
 """Types of cameras: registered models, and parameters."""
 _INERTIAL = {
@@ -32,18 +32,18 @@ _INERTIAL = {
 }  # fmt: skip
 
 
-def write(camera: PlainCamera) -> str:
+def write(camera: Camera) -> str:
     """Return the text of a calibration with one camera."""
     kind = next(
         name
         for name, (model, names) in _TYPES.items()
-        if model == camera.model and all(k in names for k, value in camera.values.items() if value)
+        if model == camera.model and all(k in names for k, value in camera.parameters.items() if value)
     )
-    values = dict(zip(_TYPES[kind][1], camera.of(*_TYPES[kind][1]), strict=True))
+    values = dict(zip(_TYPES[kind][1], given(camera, *_TYPES[kind][1]), strict=True))
     if kind == "pinhole-radtan8":
         corners = np.array([[x, y] for x in (0, camera.width - 1) for y in (0, camera.height - 1)])
         # The largest tangent of an angle from the axis for which the model is meant.
-        values["rpmax"] = float(np.hypot(*camera.mapping().inverse(corners).T).max())
+        values["rpmax"] = float(np.hypot(*camera.bare_mapping().inverse(corners).T).max())
     pose = dict.fromkeys(("px", "py", "pz", "qx", "qy", "qz"), 0.0) | {"qw": 1.0}
     content = {
         "T_imu_cam": [pose],
@@ -62,7 +62,7 @@ def recognises(text: str) -> bool:
     return '"value0"' in text and '"camera_type"' in text
 
 
-def read(text: str, path: Path) -> PlainCamera:
+def read(text: str, path: Path) -> Camera:
     """Read the first camera.
 
     Raises
@@ -87,4 +87,4 @@ def read(text: str, path: Path) -> PlainCamera:
         raise FormatError(f"has not all of {', '.join(names)} of the type {kind}", where=path)
     if kind == "ucm":
         values["beta"] = 1.0
-    return PlainCamera(path.stem, width, height, model, values)
+    return Camera.of(path.stem, (width, height), model, values)

@@ -15,14 +15,12 @@ from ...bundle import Camera
 from ...core.errors import FormatError
 from ..dbat import camera_of as dbat_camera
 from ..markup import read_markup
-from ..micmac import interior_text, read_interior
 from ..photomodeler import camera_of_numbers
-from .plain import PlainCamera
+from .plain import CENTRE, given
 
 BROWN = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
 """Parameters that both have."""
 _HEAD, _CAMERA_LINE = 4, 10
-_SCALES = ("fx", "fy", "cx", "cy")
 
 
 def in_pixels(
@@ -42,16 +40,16 @@ def in_pixels(
         "cx": x0 / pitch_mm[0] + (size[0] - 1) / 2, "cy": (size[1] - 1) / 2 - y0 / pitch_mm[1],
         "k1": k1 * c**2, "k2": k2 * c**4, "p1": -p2 * c, "p2": p1 * c, "k3": k3 * c**6,
     }  # fmt: skip
-    return {name: value for name, value in found.items() if value or name in _SCALES}
+    return {name: value for name, value in found.items() if value or name in CENTRE}
 
 
-def write_photomodeler(camera: PlainCamera) -> str:
+def write_photomodeler(camera: Camera) -> str:
     """Return the head of a text export, without images."""
     wide, tall = _format(camera)
-    c, x0, y0, *more = camera.of(*BROWN)
+    c, x0, y0, *more = given(camera, *BROWN)
     values = [c, x0 + wide / 2, tall / 2 - y0, wide, tall, *more]
     lines = [
-        camera.name or "camera",
+        camera.id or "camera",
         f"1e-06 20 {camera.width} {camera.height}",
         "1.0",
         " ".join(map(repr, values)),
@@ -67,7 +65,7 @@ def is_photomodeler(text: str) -> bool:
     return len(counts) >= 3 and counts[0] == _HEAD and counts[2] == _CAMERA_LINE
 
 
-def read_photomodeler(text: str, path: Path) -> PlainCamera:
+def read_photomodeler(text: str, path: Path) -> Camera:
     """Read the camera at the head of a text export.
 
     Raises
@@ -80,16 +78,16 @@ def read_photomodeler(text: str, path: Path) -> PlainCamera:
     width, height = int(float(lines[1][2])), int(float(lines[1][3]))
     if min(values[0], values[3], values[4]) <= 0 or min(width, height) < 1:
         raise FormatError("has a camera constant, a format or a size that is not positive", where=path)
-    return _plain(camera_of_numbers(path.stem, values, width, height))
+    return camera_of_numbers(path.stem, values, width, height)
 
 
-def write_dbat(camera: PlainCamera) -> str:
+def write_dbat(camera: Camera) -> str:
     """Return the text of a file of cameras with one camera."""
     wide, tall = _format(camera)
-    c, x0, y0, k1, k2, k3, p1, p2 = camera.of(*BROWN)
+    c, x0, y0, k1, k2, k3, p1, p2 = given(camera, *BROWN)
     aspect = camera.pitch_mm[1] / camera.pitch_mm[0]
     entries = {
-        "id": "1", "name": escape(camera.name, quote=False), "unit": "mm", "sensor": f"{wide!r},{tall!r}",
+        "id": "1", "name": escape(camera.id, quote=False), "unit": "mm", "sensor": f"{wide!r},{tall!r}",
         "image": f"{camera.width},{camera.height}", "aspect": repr(aspect), "focal": repr(c), "model": "3",
         "nK": "3", "nP": "2", "cc": repr(c), "pp": f"{(x0 + wide / 2) * aspect!r},{tall / 2 - y0!r}",
         "K": f"{k1!r},{k2!r},{k3!r}", "P": f"{p1!r},{p2!r}", "skew": "0",
@@ -106,7 +104,7 @@ def is_dbat(text: str) -> bool:
     return "<camera>" in text and "<sensor>" in text and ("<cc>" in text or "<focal>" in text)
 
 
-def read_dbat(text: str, path: Path) -> PlainCamera:
+def read_dbat(text: str, path: Path) -> Camera:
     """Read the only camera.
 
     Raises
@@ -120,13 +118,7 @@ def read_dbat(text: str, path: Path) -> PlainCamera:
     if len(found) != 1:
         raise FormatError(f"has {len(found)} cameras, not one", where=path)
     name = found[0].find("name")
-    return _plain(dbat_camera(found[0], path.stem if name is None or not name.text else name.text, ()))
-
-
-def write_micmac(camera: PlainCamera) -> str:
-    """Return the text of an interior orientation, ``AutoCal_….xml``."""
-    side = str(camera.options.get("side", "image"))
-    return interior_text(camera.values, (camera.width, camera.height), camera.pitch_mm[0], side)
+    return dbat_camera(found[0], path.stem if name is None or not name.text else name.text, ())
 
 
 def is_micmac(text: str) -> bool:
@@ -134,27 +126,9 @@ def is_micmac(text: str) -> bool:
     return "<CalibrationInternConique>" in text
 
 
-def read_micmac(text: str, path: Path) -> PlainCamera:
-    """Read an interior orientation; lengths are in pixels.
-
-    Raises
-    ------
-    FormatError
-        When it is incomplete, or the model of the distortion is another one.
-    """
-    return _plain(read_interior(path))
-
-
-def _format(camera: PlainCamera) -> tuple[float, float]:
+def _format(camera: Camera) -> tuple[float, float]:
     """Size of the image, mm."""
     return camera.width * camera.pitch_mm[0], camera.height * camera.pitch_mm[1]
-
-
-def _plain(camera: Camera) -> PlainCamera:
-    return PlainCamera(
-        camera.id, camera.width, camera.height, camera.model, camera.parameters, camera.pitch_mm,
-        dict(camera.options),
-    )  # fmt: skip
 
 
 def _numbers(words: list[str]) -> int:

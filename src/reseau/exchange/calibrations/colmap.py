@@ -4,38 +4,38 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ...bundle import Camera
 from ...core.errors import FormatError
-from .plain import RADIAL_TANGENTIAL, RATIONAL, PlainCamera, opencv_camera
+from .plain import CENTRE, FISHEYE, RADIAL_TANGENTIAL, RATIONAL, opencv_camera
 
-_CENTRE = ("fx", "fy", "cx", "cy")
-_FISHEYE = ("k1", "k2", "k3", "k4")
-# Models with their parameters, those with one focal length first.
-_MODELS: dict[str, tuple[str, ...]] = {
+# Models with their parameters, in the order of COLMAP's numbers.
+MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": CENTRE,
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "PINHOLE": _CENTRE,
-    "OPENCV": (*_CENTRE, *RADIAL_TANGENTIAL),
-    "FULL_OPENCV": (*_CENTRE, *RATIONAL),
+    "OPENCV": (*CENTRE, *RADIAL_TANGENTIAL),
+    "OPENCV_FISHEYE": (*CENTRE, *FISHEYE),
+    "FULL_OPENCV": (*CENTRE, *RATIONAL),
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV_FISHEYE": (*_CENTRE, *_FISHEYE),
 }
 
 
-def write(camera: PlainCamera) -> str:
-    """Return the text of a ``cameras.txt`` with one camera, in the first model that holds it."""
-    given = {name: value for name, value in camera.values.items() if value}
+def write(camera: Camera) -> str:
+    """Return the text of a ``cameras.txt`` with one camera, in the smallest model that holds it."""
+    given = {name: value for name, value in camera.parameters.items() if value}
     if given.get("fx") == given.get("fy"):
         given["f"] = given.get("fx", 0.0)
     fisheye = camera.model == "fisheye"
-    model, names = next(
+    holding = (
         (model, names)
-        for model, names in _MODELS.items()
+        for model, names in MODELS.items()
         if model.endswith("FISHEYE") == fisheye
         and set(given) - {"f", "fx", "fy"} <= set(names)
         and (names[0] == "fx" or "f" in given)
     )
+    model, names = min(holding, key=lambda each: len(each[1]))
     values = [given.get(name, 0.0) + 0.5 * (name in ("cx", "cy")) for name in names]
     head = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
     return f"{head}1 {model} {camera.width} {camera.height} {' '.join(map(repr, values))}\n"
@@ -43,10 +43,10 @@ def write(camera: PlainCamera) -> str:
 
 def recognises(text: str) -> bool:
     """Whether this is such a file."""
-    return any(words[1:2] and words[1] in _MODELS for words in _lines(text))
+    return any(words[1:2] and words[1] in MODELS for words in _lines(text))
 
 
-def read(text: str, path: Path) -> PlainCamera:
+def read(text: str, path: Path) -> Camera:
     """Read the only camera.
 
     Raises
@@ -58,9 +58,9 @@ def read(text: str, path: Path) -> PlainCamera:
     if len(lines) != 1:
         raise FormatError(f"has {len(lines)} cameras, not one", where=path)
     number, model, width, height, *rest = [*lines[0], *4 * [""]][: max(4, len(lines[0]))]
-    names = _MODELS.get(model)
+    names = MODELS.get(model)
     if names is None:
-        raise FormatError(f"has the model {model!r}; known are {', '.join(_MODELS)}", where=path)
+        raise FormatError(f"has the model {model!r}; known are {', '.join(MODELS)}", where=path)
     try:
         values = dict(zip(names, map(float, rest), strict=True))
         size = int(width), int(height)
@@ -68,7 +68,7 @@ def read(text: str, path: Path) -> PlainCamera:
         raise FormatError(f"has not {len(names)} numbers for {model}", where=path) from None
     focal = values.get("fx", values.get("f", 0.0)), values.get("fy", values.get("f", 0.0))
     fisheye = model.endswith("FISHEYE")
-    found = [values.get(name, 0.0) for name in (_FISHEYE if fisheye else RATIONAL)]
+    found = [values.get(name, 0.0) for name in (FISHEYE if fisheye else RATIONAL)]
     centre = values["cx"] - 0.5, values["cy"] - 0.5
     return opencv_camera(number, size, focal, centre, found, path, fisheye=fisheye)
 

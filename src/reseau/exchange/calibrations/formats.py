@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 
+from ...bundle import Camera
 from ...calibration import Calibration, CameraMapping, read_calibration, required_use
 from ...calibration.document import CameraModel, Covariance, Quantity
 from ...core.errors import FormatError, UsageError
@@ -19,13 +20,12 @@ from ...optics.cameras import convert
 from ...optics.cameras.registry import camera_model, unit_of
 from ...optics.cameras.splined import SplinedStereographic, SplineGrid
 from ...optics.poses import rotation_matrix
+from ..micmac import interior_text, read_interior
 from . import basalt, brown, colmap, matlab, metashape, mrcal, opencv, openptv, yamls
-from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, Mounted, PlainCamera
+from .plain import CENTRE, FISHEYE, RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, Mounted
 
-_CENTRE = ("fx", "fy", "cx", "cy")
-_RADTAN, _FIVE = (*_CENTRE, *RADIAL_TANGENTIAL), (*_CENTRE, *RADIAL_TANGENTIAL, "k3")
-_EIGHT, _TWELVE = (*_CENTRE, *RATIONAL), (*_CENTRE, *THIN_PRISM)
-_FISHEYE = (*_CENTRE, "k1", "k2", "k3", "k4")
+_RADTAN, _FIVE = (*CENTRE, *RADIAL_TANGENTIAL), (*CENTRE, *RADIAL_TANGENTIAL, "k3")
+_EIGHT, _TWELVE = (*CENTRE, *RATIONAL), (*CENTRE, *THIN_PRISM)
 # The most specific formats are tried first.
 _ORDER = (
     "ros", "kalibr", "basalt", "mrcal", "dbat", "micmac", "metashape", "opencv", "matlab", "openptv",
@@ -63,8 +63,8 @@ class CalibrationFormat:
         Camera of a text.
     beside : mapping of str to callable
         Texts of further files, by the suffixes with which they lie beside the first.
-    comment : callable, optional
-        Puts a comment of one line into a text; None where the format has no comments.
+    comment : str
+        Beginning of a line with a comment, or its place; empty where the format has no comments.
     splined : bool
         Whether it also holds cameras with a spline surface, which describe every lens.
     sides : tuple of str
@@ -81,14 +81,14 @@ class CalibrationFormat:
     name: str
     suffixes: tuple[str, ...]
     models: tuple[tuple[str, tuple[str, ...]], ...]
-    write: Callable[[PlainCamera], str]
+    write: Callable[[Camera], str]
     recognises: Callable[[str], bool]
-    read: Callable[[str, Path], PlainCamera]
-    beside: Mapping[str, Callable[[PlainCamera], str]] = field(default_factory=dict)
+    read: Callable[[str, Path], Camera]
+    beside: Mapping[str, Callable[[Camera], str]] = field(default_factory=dict)
     splined: bool = False
     sides: tuple[str, ...] = ("image",)
     square: bool = False
-    comment: Callable[[str, str], str] | None = None
+    comment: Literal["", "#", "%", "after the head"] = ""
 
 
 def calibration_formats() -> dict[str, CalibrationFormat]:
@@ -99,23 +99,23 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
     >>> "micmac" in calibration_formats()
     True
     """
-    wide, fisheye = (("opencv", _FIVE), ("opencv", _EIGHT)), ("fisheye", _FISHEYE)
-    spheres = ("double_sphere", (*_CENTRE, "xi", "alpha")), ("eucm", (*_CENTRE, "alpha", "beta"))
+    wide, fisheye = (("opencv", _FIVE), ("opencv", _EIGHT)), ("fisheye", (*CENTRE, *FISHEYE))
+    spheres = ("double_sphere", (*CENTRE, "xi", "alpha")), ("eucm", (*CENTRE, "alpha", "beta"))
     formats = (
         CalibrationFormat(
             "opencv", (".yml", ".yaml", ".xml", ".json"),
-            (*wide, ("opencv_full", _TWELVE), ("opencv_full", (*_CENTRE, *TILTED)), fisheye),
-            opencv.write, opencv.recognises, opencv.read, comment=_after_head,
+            (*wide, ("opencv_full", _TWELVE), ("opencv_full", (*CENTRE, *TILTED)), fisheye),
+            opencv.write, opencv.recognises, opencv.read, comment="after the head",
         ),
         CalibrationFormat(
             "ros", (".yaml",), (*wide, fisheye), yamls.write_ros, yamls.is_ros, yamls.read_ros,
-            comment=_hash,
+            comment="#",
         ),
         CalibrationFormat(
             "kalibr", (".yaml",),
             (("opencv", _RADTAN), fisheye, ("omni", (*_RADTAN, "xi")),
              *spheres),
-            yamls.write_kalibr, yamls.is_kalibr, yamls.read_kalibr, comment=_hash,
+            yamls.write_kalibr, yamls.is_kalibr, yamls.read_kalibr, comment="#",
         ),
         CalibrationFormat(
             "basalt", (".json",), (("opencv", _EIGHT), fisheye, *spheres),
@@ -123,16 +123,16 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
         ),
         CalibrationFormat(
             "colmap", (".txt",), (("opencv", _RADTAN), ("opencv", _EIGHT), fisheye),
-            colmap.write, colmap.recognises, colmap.read, comment=_hash,
+            colmap.write, colmap.recognises, colmap.read, comment="#",
         ),
         CalibrationFormat(
             "mrcal", (".cameramodel",),
-            (("opencv", _RADTAN), *wide, ("opencv_full", _TWELVE), ("stereographic", _CENTRE)), mrcal.write,
-            mrcal.recognises, mrcal.read, splined=True, comment=_hash,
+            (("opencv", _RADTAN), *wide, ("opencv_full", _TWELVE), ("stereographic", CENTRE)), mrcal.write,
+            mrcal.recognises, mrcal.read, splined=True, comment="#",
         ),
         CalibrationFormat(
             "metashape", (".xml",), (("opencv", _FIVE), fisheye),
-            metashape.write, metashape.recognises, metashape.read, comment=_after_head,
+            metashape.write, metashape.recognises, metashape.read, comment="after the head",
         ),
         CalibrationFormat(
             "photomodeler", (".txt",), (("brown", brown.BROWN),),
@@ -140,16 +140,16 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
         ),
         CalibrationFormat(
             "dbat", (".xml",), (("brown", brown.BROWN),), brown.write_dbat, brown.is_dbat, brown.read_dbat,
-            comment=_after_head,
+            comment="after the head",
         ),
         CalibrationFormat(
             "micmac", (".xml",), (("brown", (*brown.BROWN, "B1", "B2")),),
-            brown.write_micmac, brown.is_micmac, brown.read_micmac, comment=_after_head,
+            interior_text, brown.is_micmac, lambda _, path: read_interior(path), comment="after the head",
             sides=("image", "object"), square=True,
         ),
         CalibrationFormat(
             "matlab", (".m",), (("opencv", _FIVE),), matlab.write, matlab.recognises, matlab.read,
-            comment=_percent,
+            comment="%",
         ),
         CalibrationFormat(
             "openptv", (".ori",), (("openptv", openptv.OPENPTV),),
@@ -159,30 +159,12 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
     return {entry.name: entry for entry in formats}
 
 
-def _hash(text: str, comment: str) -> str:
-    return f"# {comment}\n{text}"
-
-
-def _percent(text: str, comment: str) -> str:
-    return f"% {comment}\n{text}"
-
-
-def _after_head(text: str, comment: str) -> str:
-    """A comment after the first line of XML, or the two of the YAML of OpenCV."""
-    if text.lstrip().startswith("<"):
-        head, _, rest = text.partition("\n")
-        # Two hyphens would end a comment of XML.
-        return f"{head}\n<!-- {comment.replace('--', '- -')} -->\n{rest}"
-    head, mark, rest = text.partition("---\n")
-    return f"{head}{mark}# {comment}\n{rest}"
-
-
 class Exported(NamedTuple):
     """A camera as it was written.
 
     Parameters
     ----------
-    camera : PlainCamera
+    camera : Camera
         In the model that the format holds.
     rms_px, greatest_px : float
         Differences from the calibration over the image: root mean square, and largest; 0 where the model is
@@ -194,11 +176,11 @@ class Exported(NamedTuple):
 
     Examples
     --------
-    >>> Exported(PlainCamera("front", 640, 480, "opencv", {"fx": 800.0, "fy": 800.0}), 0.0, 0.0, 1.0).rms_px
+    >>> Exported(Camera.of("front", (640, 480), "opencv", {"fx": 800.0, "fy": 800.0}), 0.0, 0.0, 1.0).rms_px
     0.0
     """
 
-    camera: PlainCamera
+    camera: Camera
     rms_px: float
     greatest_px: float
     share: float
@@ -206,7 +188,7 @@ class Exported(NamedTuple):
 
     def __repr__(self) -> str:
         off = f"at most {self.greatest_px:.2g} px off"
-        return f"<Exported: {self.camera.name}, model {self.camera.model}, {off}>"
+        return f"<Exported: {self.camera.id}, model {self.camera.model}, {off}>"
 
 
 def export_calibration(
@@ -240,7 +222,7 @@ def export_calibration(
     --------
     >>> import tempfile
     >>> values = {"fx": 800.0, "fy": 800.0, "cx": 319.5, "cy": 239.5}
-    >>> camera = PlainCamera("front", 640, 480, "opencv", values)
+    >>> camera = Camera.of("front", (640, 480), "opencv", values)
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     file = Path(folder) / "front.m"
     ...     done = export_calibration(_calibration(camera, {}), "matlab", file)
@@ -272,9 +254,18 @@ def _notes(calibrations: Sequence[Calibration], anyway: bool) -> tuple[str, ...]
 def _commented(form: CalibrationFormat, text: str, calibrations: Sequence[Calibration]) -> str:
     """The text with the verdicts in a comment."""
     said = [f"{each.name}: {each.assessment.short}" for each in calibrations if each.assessment is not None]
-    if form.comment is None or not said:
+    comment = " ".join("; ".join(said).split())
+    if not form.comment or not said:
         return text
-    return form.comment(text, " ".join("; ".join(said).split()))
+    if form.comment != "after the head":
+        return f"{form.comment} {comment}\n{text}"
+    if text.lstrip().startswith("<"):
+        head, _, rest = text.partition("\n")
+        # Two hyphens would end a comment of XML.
+        return f"{head}\n<!-- {comment.replace('--', '- -')} -->\n{rest}"
+    # After the two lines of the YAML of OpenCV.
+    head, mark, rest = text.partition("---\n")
+    return f"{head}{mark}# {comment}\n{rest}"
 
 
 def export_calibrations(
@@ -396,15 +387,14 @@ def _splined(lens: CameraMapping) -> str:
 
 def _as_it_is(
     form: CalibrationFormat, name: str, lens: CameraMapping, stored: Mapping[str, Any]
-) -> PlainCamera | None:
+) -> Camera | None:
     """The camera without conversion; None where the format lacks its model or one of its parameters."""
-    width, height = lens.size
     model, given = str(stored["model"]), tuple(float(v) for v in stored["pitch_mm"])
     if model == "mapping":
         return None
     registered = camera_model(model)
     values = dict(zip(lens.mapping.names, lens.mapping.values.tolist(), strict=True))
-    own = {key: value for key, value in values.items() if value or key in _CENTRE}
+    own = {key: value for key, value in values.items() if value or key in CENTRE}
     options = registered.checked_options(
         {o.name: stored[o.name] for o in registered.options if o.name in stored}
     )
@@ -417,16 +407,16 @@ def _as_it_is(
             return None
         model, own, given, options = (
             "opencv",
-            brown.in_pixels(own, (width, height), (given[0], given[1])),
+            brown.in_pixels(own, lens.size, (given[0], given[1])),
             (1.0, 1.0),
             {},
         )
     for wanted, names in form.models:
         same = wanted.partition("_full")[0] == model.partition("_full")[0] and set(own) <= set(names)
         if plain and same and any(options == _options(wanted, side) for side in form.sides):
-            return PlainCamera(name, width, height, wanted, own, (given[0], given[1]), options)
+            return Camera.of(name, lens.size, wanted, own, pitch_mm=(given[0], given[1]), options=options)
     if form.splined and isinstance(lens.mapping, SplinedStereographic):
-        return PlainCamera(name, width, height, model, own)
+        return Camera.of(name, lens.size, model, own)
     return None
 
 
@@ -435,7 +425,7 @@ def formats_holding(calibration: Calibration) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> camera = PlainCamera("front", 640, 480, "fisheye", {"fx": 300.0, "fy": 300.0, "k1": 0.1})
+    >>> camera = Camera.of("front", (640, 480), "fisheye", {"fx": 300.0, "fy": 300.0, "k1": 0.1})
     >>> formats_holding(_calibration(camera, {}))
     ('opencv', 'ros', 'kalibr', 'basalt', 'colmap', 'metashape')
     """
@@ -482,7 +472,6 @@ def exported_lens(
     own = _as_it_is(form, name, lens, stored)
     if own is not None:
         return Exported(own, 0.0, 0.0, 1.0)
-    width, height = lens.size
     pitch_mm = float(stored["pitch_mm"][0])
     best: Exported | None = None
     rays = "parallel" if lens.mapping.parallel else "central"
@@ -496,15 +485,13 @@ def exported_lens(
         pitch = _pitch(lens, pitch_mm) if camera_model(wanted).needs_pitch else (1.0, 1.0)
         pitch = (pitch[0], pitch[0]) if form.square else pitch
         try:
-            done = convert(
-                lens.mapping, PixelGrid(width, height, pitch), wanted, _options(wanted), free=names
-            )
+            done = convert(lens.mapping, PixelGrid(*lens.size, pitch), wanted, _options(wanted), free=names)
         except UsageError as error:
             why = error.reason
             continue
         values = dict(zip(done.mapping.names, done.mapping.values.tolist(), strict=True))
         held = {key: values[key] for key in names or values if key in values}
-        camera = PlainCamera(name, width, height, wanted, held, pitch, _options(wanted))
+        camera = Camera.of(name, lens.size, wanted, held, pitch_mm=pitch, options=_options(wanted))
         trial = Exported(camera, done.rms_px, done.greatest_px, done.share)
         if best is None or trial.greatest_px < best.greatest_px:
             best = trial
@@ -577,10 +564,8 @@ def any_calibration(path: Path | str) -> Calibration:
     return read_calibration(path) if ours else import_calibration(path)
 
 
-def _calibration(camera: PlainCamera, provenance: dict[str, Any]) -> Calibration:
-    model = camera_model(camera.model)
-    scales = (*_CENTRE, *model.required)
-    names = [name for name in model.names if name in scales or camera.values.get(name, 0.0)]
+def _calibration(camera: Camera, provenance: dict[str, Any]) -> Calibration:
+    scales = (*CENTRE, *camera_model(camera.model).required)
     entry: CameraModel = {
         "model": camera.model, "width": camera.width, "height": camera.height,
         "pitch_mm": list(camera.pitch_mm),
@@ -588,11 +573,12 @@ def _calibration(camera: PlainCamera, provenance: dict[str, Any]) -> Calibration
     entry = cast(CameraModel, entry | dict(camera.options))
     return Calibration(
         kind="camera",
-        name=camera.name,
+        name=camera.id,
         model=entry,
         parameters={
-            name: Quantity(value=camera.values.get(name, 0.0), sigma=0.0, unit=unit_of(name, camera.model))
-            for name in names
+            name: Quantity(value=value, sigma=0.0, unit=unit_of(name, camera.model))
+            for name, value in camera.parameters.items()
+            if value or name in scales
         },
         covariance=Covariance(names=(), matrix=()),
         sigma0=None,

@@ -11,18 +11,19 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from ...bundle import Camera
 from ...core.errors import FormatError
-from .plain import RADIAL_TANGENTIAL, PlainCamera, opencv_camera
+from .plain import CENTRE, RADIAL_TANGENTIAL, given, opencv_camera
 
 _ASSIGNED = re.compile(r"^\s*(\w+)\s*=\s*(\[[^\]]*\]|[^;%\n]+)", re.MULTILINE)
 
 
-def write(camera: PlainCamera) -> str:
+def write(camera: Camera) -> str:
     """Return the text of the script."""
-    fx, fy, cx, cy = (repr(v) for v in camera.of("fx", "fy", "cx", "cy"))
-    kc = " ; ".join(repr(v) for v in camera.of(*RADIAL_TANGENTIAL, "k3"))
+    fx, fy, cx, cy = (repr(v) for v in given(camera, *CENTRE))
+    kc = " ; ".join(repr(v) for v in given(camera, *RADIAL_TANGENTIAL, "k3"))
     return (
-        f"% Camera {camera.name}; pixels are counted from the centre of the first one, which is (0, 0).\n"
+        f"% Camera {camera.id}; pixels are counted from the centre of the first one, which is (0, 0).\n"
         f"fc = [ {fx} ; {fy} ];\ncc = [ {cx} ; {cy} ];\nalpha_c = 0.0;\nkc = [ {kc} ];\n"
         f"nx = {camera.width};\nny = {camera.height};\n"
         "% intrinsics = cameraIntrinsics(fc', cc' + 1, [ny nx], RadialDistortion = kc([1 2 5])', "
@@ -35,7 +36,7 @@ def recognises(text: str) -> bool:
     return {"fc", "cc", "kc"} <= {name for name, _ in _ASSIGNED.findall(text)}
 
 
-def read(text: str, path: Path) -> PlainCamera:
+def read(text: str, path: Path) -> Camera:
     """Read a camera.
 
     Raises

@@ -17,16 +17,17 @@ from math import isfinite
 from pathlib import Path
 from xml.etree import ElementTree
 
+from ...bundle import Camera
 from ...core.errors import FormatError
-from .plain import PlainCamera, opencv_camera
+from .plain import given, opencv_camera
 
 _FISHEYE = ("fisheye", "equidistant_fisheye")
 
 
-def write(camera: PlainCamera) -> str:
+def write(camera: Camera) -> str:
     """Return the text of a calibration."""
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
-    fx, fy, cx, cy, k1, k2, k3, k4, p1, p2 = camera.of(*names)
+    fx, fy, cx, cy, k1, k2, k3, k4, p1, p2 = given(camera, *names)
     values = {
         "projection": "fisheye" if camera.model == "fisheye" else "frame",
         "width": camera.width,
@@ -51,7 +52,7 @@ def recognises(text: str) -> bool:
     return "<calibration" in text and "<projection>" in text
 
 
-def read(text: str, path: Path) -> PlainCamera:
+def read(text: str, path: Path) -> Camera:
     """Read a calibration.
 
     Raises

@@ -10,10 +10,11 @@ import ast
 from math import isfinite
 from pathlib import Path
 
+from ...bundle import Camera
 from ...core.errors import FormatError, UsageError
 from ...optics.cameras.registry import camera_model
 from ...optics.cameras.splined import SplinedStereographic
-from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, PlainCamera, opencv_camera
+from .plain import CENTRE, RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, given, opencv_camera
 
 _MODELS: dict[str, tuple[str, ...]] = {
     "LENSMODEL_PINHOLE": (),
@@ -22,22 +23,21 @@ _MODELS: dict[str, tuple[str, ...]] = {
     "LENSMODEL_OPENCV8": RATIONAL,
     "LENSMODEL_OPENCV12": THIN_PRISM,
 }
-_CENTRE = ("fx", "fy", "cx", "cy")
 _STEREOGRAPHIC, _SPLINED = "LENSMODEL_STEREOGRAPHIC", "LENSMODEL_SPLINED_STEREOGRAPHIC"
 _OURS = "splined_stereographic"
 
 
-def write(camera: PlainCamera) -> str:
+def write(camera: Camera) -> str:
     """Return the text of a camera model, with the camera at the origin."""
-    mapping = camera.mapping()
+    mapping = camera.bare_mapping()
     if isinstance(mapping, SplinedStereographic):
-        model, values = _SPLINED + mapping.grid.name.removeprefix(_OURS), camera.of(*mapping.names)
+        model, values = _SPLINED + mapping.grid.name.removeprefix(_OURS), given(camera, *mapping.names)
     elif camera.model == "stereographic":
-        model, values = _STEREOGRAPHIC, camera.of(*_CENTRE)
+        model, values = _STEREOGRAPHIC, given(camera, *CENTRE)
     else:
-        used = {name for name, value in camera.values.items() if value and name not in _CENTRE}
+        used = {name for name, value in camera.parameters.items() if value and name not in CENTRE}
         model = next(name for name, own in _MODELS.items() if own and used <= set(own))
-        values = camera.of(*_CENTRE, *_MODELS[model])
+        values = given(camera, *CENTRE, *_MODELS[model])
     return (
         "{\n"
         f"    'lensmodel':  '{model}',\n\n"
@@ -55,7 +55,7 @@ def recognises(text: str) -> bool:
     return "LENSMODEL_" in text
 
 
-def read(text: str, path: Path) -> PlainCamera:
+def read(text: str, path: Path) -> Camera:
     """Read a camera.
 
     Raises
@@ -81,15 +81,15 @@ def read(text: str, path: Path) -> PlainCamera:
     return opencv_camera(path.stem, (width, height), (fx, fy), (cx, cy), found, path)
 
 
-def _stereographic(path: Path, model: str, numbers: list[float], size: tuple[int, int]) -> PlainCamera:
+def _stereographic(path: Path, model: str, numbers: list[float], size: tuple[int, int]) -> Camera:
     """The stereographic camera, with or without a spline surface."""
     name = "stereographic" if model == _STEREOGRAPHIC else _OURS + model.removeprefix(_SPLINED)
     try:
-        names = _CENTRE if model == _STEREOGRAPHIC else camera_model(name).names
+        names = CENTRE if model == _STEREOGRAPHIC else camera_model(name).names
     except UsageError as error:
         raise FormatError(f"has the lens model {model}: {error}", where=path) from None
     if len(numbers) != len(names):
         raise FormatError(f"has {len(numbers)} intrinsics, not the {len(names)} of {model}", where=path)
     if not all(isfinite(number) for number in numbers) or min(numbers[:2]) <= 0 or min(size) < 1:
         raise FormatError("has no finite intrinsics and image size", where=path)
-    return PlainCamera(path.stem, *size, name, dict(zip(names, numbers, strict=True)))
+    return Camera.of(path.stem, size, name, dict(zip(names, numbers, strict=True)))

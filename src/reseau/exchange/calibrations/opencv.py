@@ -13,18 +13,19 @@ from typing import Any
 import cv2
 import numpy as np
 
+from ...bundle import Camera
 from ...core.errors import FormatError
 from ...optics.cameras.opencv import opencv_coefficients
-from .plain import Mounted, PlainCamera, opencv_camera
+from .plain import CENTRE, FISHEYE, Mounted, given, opencv_camera
 
 
-def write(camera: PlainCamera) -> str:
+def write(camera: Camera) -> str:
     """Return the text of a YAML file."""
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    fx, fy, cx, cy = camera.of("fx", "fy", "cx", "cy")
+    fx, fy, cx, cy = given(camera, *CENTRE)
     storage.write("image_width", camera.width)
     storage.write("image_height", camera.height)
-    storage.write("camera_name", camera.name)
+    storage.write("camera_name", camera.id)
     storage.write("distortion_model", "fisheye" if camera.model == "fisheye" else "opencv")
     storage.write("camera_matrix", np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
     storage.write("distortion_coefficients", np.array(coefficients(camera)).reshape(-1, 1))
@@ -40,7 +41,7 @@ def write_pair(left: Mounted, right: Mounted) -> str:
     storage.write("image_width", left.camera.width)
     storage.write("image_height", left.camera.height)
     for number, mounted in enumerate((left, right), start=1):
-        fx, fy, cx, cy = mounted.camera.of("fx", "fy", "cx", "cy")
+        fx, fy, cx, cy = given(mounted.camera, *CENTRE)
         storage.write(f"M{number}", np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
         storage.write(f"D{number}", np.array(coefficients(mounted.camera)).reshape(1, -1))
     storage.write("R", np.ascontiguousarray(right.rotation))
@@ -48,11 +49,11 @@ def write_pair(left: Mounted, right: Mounted) -> str:
     return storage.releaseAndGetString()
 
 
-def coefficients(camera: PlainCamera) -> list[float]:
+def coefficients(camera: Camera) -> list[float]:
     """Return the shortest list of OpenCV's coefficients that holds the camera."""
     if camera.model == "fisheye":
-        return camera.of("k1", "k2", "k3", "k4")
-    return opencv_coefficients(camera.values)
+        return given(camera, *FISHEYE)
+    return opencv_coefficients(camera.parameters)
 
 
 def recognises(text: str) -> bool:
@@ -61,7 +62,7 @@ def recognises(text: str) -> bool:
     return head.startswith(("%YAML", "<?xml", "{")) and "camera_matrix" in text.lower()
 
 
-def read(text: str, path: Path) -> PlainCamera:
+def read(text: str, path: Path) -> Camera:
     """Read a camera.
 
     Raises

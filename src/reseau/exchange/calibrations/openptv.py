@@ -6,11 +6,13 @@ them in a line after the numbers, which OpenPTV does not read. The pose is that 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
+from ...bundle import Camera
 from ...core.errors import FormatError
 from ...io import read_text
-from .plain import PlainCamera
+from .plain import given
 
 OPENPTV = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "B1", "she")
 BESIDE = ".addpar"
@@ -18,9 +20,9 @@ _NUMBERS = 21
 _SIZE = "# imx imy pix_x pix_y of ptv.par:"
 
 
-def write(camera: PlainCamera) -> str:
+def write(camera: Camera) -> str:
     """Return the text of the ``.ori`` file."""
-    c, x0, y0 = camera.of("c", "x0", "y0")
+    c, x0, y0 = given(camera, "c", "x0", "y0")
     size = f"{camera.width} {camera.height} {camera.pitch_mm[0]!r} {camera.pitch_mm[1]!r}"
     return (
         "0.0 0.0 0.0\n    0.0 0.0 0.0\n\n    1.0 0.0 0.0\n    0.0 1.0 0.0\n    0.0 0.0 1.0\n\n"
@@ -28,9 +30,9 @@ def write(camera: PlainCamera) -> str:
     )
 
 
-def write_beside(camera: PlainCamera) -> str:
+def write_beside(camera: Camera) -> str:
     """Return the text of the ``.addpar`` file: k1 k2 k3 p1 p2 scx she."""
-    *distortion, b1, she = camera.of(*OPENPTV[3:])
+    *distortion, b1, she = given(camera, *OPENPTV[3:])
     return " ".join(map(repr, [*distortion, 1.0 + b1, she])) + "\n"
 
 
@@ -40,7 +42,7 @@ def recognises(text: str) -> bool:
     return [len(line) for line in lines[:8]] == [3, 3, 3, 3, 3, 2, 1, 3] and len(lines) == 8
 
 
-def read(text: str, path: Path) -> PlainCamera:
+def read(text: str, path: Path, free: Sequence[str] = ()) -> Camera:
     """Read a camera, with the ``.addpar`` file and ``ptv.par`` beside it.
 
     Raises
@@ -61,7 +63,8 @@ def read(text: str, path: Path) -> PlainCamera:
     if not c > 0:
         raise FormatError("has a principal distance that is not positive", where=path)
     values = dict(zip(OPENPTV, (c, x0, y0, k1, k2, k3, p1, p2, scx - 1.0, she), strict=True))
-    return PlainCamera(path.stem, int(width), int(height), "openptv", values, (pitch[0], pitch[1]))
+    size_px = int(width), int(height)
+    return Camera.of(path.stem, size_px, "openptv", values, free, pitch_mm=(pitch[0], pitch[1]))
 
 
 def _sizes(path: Path) -> list[float]:

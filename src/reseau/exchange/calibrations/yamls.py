@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from ...bundle import Camera
 from ...core.errors import FormatError
 from .opencv import coefficients
-from .plain import RADIAL_TANGENTIAL, Mounted, PlainCamera, opencv_camera
+from .plain import CENTRE, FISHEYE, RADIAL_TANGENTIAL, Mounted, given, opencv_camera
 
 _SHAPES = {
     "omni": ("omni", ("xi",)),
@@ -25,12 +26,13 @@ _SHAPES = {
     "eucm": ("eucm", ("alpha", "beta")),
 }
 """Registered models, those of Kalibr, and the parameters that come first."""
+_DISTORTIONS = {"radtan": RADIAL_TANGENTIAL, "equidistant": FISHEYE, "none": ()}
 _ROS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
 
 
-def write_ros(camera: PlainCamera) -> str:
+def write_ros(camera: Camera) -> str:
     """Return the text of a ``camera_info`` file."""
-    fx, fy, cx, cy = camera.of("fx", "fy", "cx", "cy")
+    fx, fy, cx, cy = given(camera, *CENTRE)
     found = coefficients(camera)
     model = (
         "equidistant"
@@ -41,7 +43,7 @@ def write_ros(camera: PlainCamera) -> str:
         {
             "image_width": camera.width,
             "image_height": camera.height,
-            "camera_name": camera.name,
+            "camera_name": camera.id,
             "camera_matrix": _matrix(3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
             "distortion_model": "equidistant" if camera.model == "fisheye" else model,
             "distortion_coefficients": _matrix(1, len(found), found),
@@ -62,7 +64,7 @@ def is_ros(text: str) -> bool:
     return "distortion_model:" in text and "projection_matrix:" in text
 
 
-def read_ros(text: str, path: Path) -> PlainCamera:
+def read_ros(text: str, path: Path) -> Camera:
     """Read a camera of ROS.
 
     Raises
@@ -91,7 +93,7 @@ def read_ros(text: str, path: Path) -> PlainCamera:
     return opencv_camera(name, size, (fx, fy), (cx, cy), found, path, fisheye=fisheye)
 
 
-def write_kalibr(camera: PlainCamera) -> str:
+def write_kalibr(camera: Camera) -> str:
     """Return the text of a ``camchain`` file with one camera."""
     return _chain([_entry(camera)])
 
@@ -113,19 +115,18 @@ def _chain(entries: list[dict[str, Any]]) -> str:
     return text
 
 
-def _entry(camera: PlainCamera) -> dict[str, Any]:
-    centre = camera.of("fx", "fy", "cx", "cy")
+def _entry(camera: Camera) -> dict[str, Any]:
+    centre = given(camera, *CENTRE)
     kind, own = _SHAPES.get(camera.model, ("pinhole", ()))
     distortion = {"opencv": "radtan", "fisheye": "equidistant", "omni": "radtan"}
-    names = {"radtan": RADIAL_TANGENTIAL, "equidistant": ("k1", "k2", "k3", "k4"), "none": ()}
     model = distortion.get(camera.model, "none")
     return {
         "camera_model": kind,
-        "intrinsics": [*camera.of(*own), *centre],
+        "intrinsics": [*given(camera, *own), *centre],
         "distortion_model": model,
-        "distortion_coeffs": camera.of(*names[model]),
+        "distortion_coeffs": given(camera, *_DISTORTIONS[model]),
         "resolution": [camera.width, camera.height],
-        "rostopic": f"/{camera.name}/image_raw",
+        "rostopic": f"/{camera.id}/image_raw",
     }
 
 
@@ -134,7 +135,7 @@ def is_kalibr(text: str) -> bool:
     return "cam0:" in text and "intrinsics:" in text
 
 
-def read_kalibr(text: str, path: Path) -> PlainCamera:
+def read_kalibr(text: str, path: Path) -> Camera:
     """Read the first camera of a chain.
 
     Raises
@@ -154,25 +155,19 @@ def read_kalibr(text: str, path: Path) -> PlainCamera:
         raise FormatError(
             "has no complete camera cam0 of the model pinhole, omni, ds or eucm", where=path
         ) from None
-    names = {"radtan": RADIAL_TANGENTIAL, "equidistant": ("k1", "k2", "k3", "k4"), "none": ()}.get(model)
+    names, fisheye, size = _DISTORTIONS.get(model), model == "equidistant", (width, height)
     if (
         names is None
         or len(found) not in (len(names), 0)
         or len(shape) != len(own)
-        or (model == "equidistant" and kind != "pinhole")
+        or (fisheye and kind != "pinhole")
     ):
         raise FormatError(f"has the model {kind} with the distortion {model!r}, which is unknown", where=path)
-    name = path.stem
-    if model == "equidistant":
-        return opencv_camera(
-            name, (width, height), (fx, fy), (cx, cy), found or [0.0] * 4, path, fisheye=True
-        )
-    plain = opencv_camera(name, (width, height), (fx, fy), (cx, cy), found, path)
+    found = found or [0.0] * len(names)
+    plain = opencv_camera(path.stem, size, (fx, fy), (cx, cy), found, path, fisheye=fisheye)
     if kind == "pinhole":
         return plain
-    return PlainCamera(
-        name, width, height, registered, {**plain.values, **dict(zip(own, shape, strict=True))}
-    )
+    return Camera.of(path.stem, size, registered, plain.parameters | dict(zip(own, shape, strict=True)))
 
 
 def _mapping(text: str, path: Path) -> dict[str, Any]:

@@ -243,6 +243,10 @@ class CameraModel:
             )
         return both
 
+    def column(self, values: Mapping[str, float]) -> Array:
+        """Values (parameters,) by name, zero where they are missing."""
+        return np.array([values.get(name, 0.0) for name in self.names], dtype=np.float64)
+
     def undistorted(self, values: ArrayLike) -> Array:
         """The same values with all distortion parameters zero."""
         bent = [p.role == "distortion" for p in self.parameters]
@@ -250,8 +254,7 @@ class CameraModel:
 
     def start_values(self, f: float, grid: PixelGrid) -> Array:
         """Approximate values (parameters,) for a focal length of f pixels along the rows."""
-        given = self.start(f, grid)
-        return np.array([given.get(name, 0.0) for name in self.names])
+        return self.column(self.start(f, grid))
 
     def rescaled(self, values: ArrayLike, f: float, grid: PixelGrid) -> Array:
         """The same values with the scale parameters for a focal length of f pixels."""

@@ -26,7 +26,7 @@ from typing import Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.data import Array, Mask, Rows
+from ...core.data import Array, Mask, Rows, twice
 from ...core.display import Display
 from ...core.errors import UsageError
 
@@ -467,9 +467,8 @@ class Refraction(Display):
             ("media", [medium.name for medium in self.media]),
             ("windows", [window.name for window in self.windows]),
         ):
-            twice = [name for k, name in enumerate(names) if name in names[:k]]
-            if twice:
-                raise UsageError(f"{twice[0]!r} is contained twice", where=f"refraction.{what}")
+            if (again := twice(names)) is not None:
+                raise UsageError(f"{again!r} is contained twice", where=f"refraction.{what}")
         known = [medium.name for medium in self.media]
         for window in self.windows:
             for name in window.media:
