@@ -484,7 +484,7 @@ def test_pages_stay_true_when_the_clock_is_set_back_and_forth(
         browser.open(bench)
         browser.until("ready", "#state")
         for axis in ("tilt", "roll", "camera_roll"):
-            browser.click(f'button[aria-label="Home {axis}"]')
+            press(browser, f'button[aria-label="Home {axis}"]')
             until(lambda axis=axis: f"{axis}\t0.000 deg" in browser.text("#axes-title ~ div"))
             browser.until("ready", "#state")
         # Half a minute, as by a time server, also in the browser: the page goes on.
