@@ -13,7 +13,6 @@ import typer
 from ..core import vocabulary as v
 from ..core.errors import EstimationError, UsageError
 from ..core.files import writable
-from ..core.numbers import or_null
 from ..core.options import Option
 from .common import Place, pairs_of, say, say_either, say_json
 from .declared import Commands
@@ -260,6 +259,7 @@ def drift(
 
     With covariates, drift that they explain is distinguished from other drift.
     """
+    from ..core.numbers import or_null
     from ..service import ChartOptions, CovariateTable
 
     options = ChartOptions(kind=chart, rate=rate, runs_per_year=runs_per_year)

@@ -57,7 +57,7 @@ _MODULES = (
     "bundle.document", "calibration.document", "capture.bench", "io.board", "io.design", "io.edges",
     "io.fiducials", "io.frame", "io.lens", "io.measurement", "io.network", "io.refraction", "io.targets",
     "io.testfield", "report.scene", "service.audit", "service.certificates.data", "service.covariates",
-    "service.alarms", "service.recalibration", "service.rules", "service.schedule", "sessions.parameters",
+    "service.delivering", "service.recalibration", "service.rules", "service.schedule", "sessions.parameters",
 )  # fmt: skip
 """Modules of the project that define documents."""
 
