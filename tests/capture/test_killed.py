@@ -156,13 +156,16 @@ def held_sets(kept: Session) -> list[tuple[str, int, str]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["testfield", "frames", "faults", "two cameras"])
-@pytest.mark.timeout(7200)
+@pytest.mark.timeout(3600)
 def test_a_killed_and_resumed_session_gives_the_same_result(kind: str, tmp_path: Path) -> None:
     rng, attempts = random.Random(kind), count(7)
     # The same faults again would end a session at the same place for ever.
-    while (found := run(tmp_path / "undisturbed", kind, None, next(attempts))).code != 0:
+    parts = [run(tmp_path / "undisturbed", kind, None, next(attempts))]
+    while parts[-1].code != 0:
         assert kind in FAULTY  # those of the instruments end a session; it is resumed
-    seconds = found.seconds
+        parts.append(run(tmp_path / "undisturbed", kind, None, next(attempts)))
+    # Of all parts: the last one may be so short that a session killed within it never makes progress.
+    seconds = sum(part.seconds for part in parts)
     undisturbed = held(tmp_path / "undisturbed", kind)
     assert len(undisturbed[0]) == (FRAMES if kind in ("frames", "two cameras") else len(POSES))
     kills = sessions = 0
