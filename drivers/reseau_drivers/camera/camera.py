@@ -475,33 +475,33 @@ class CameraDriver(Device[S]):
         """Test the camera: identity, frame rate, lost frames, clock, and noise at the shortest exposure.
 
         The noise is the standard deviation of the difference of two frames, divided by √2, so that fixed
-        patterns cancel. Cover the lens to measure the dark noise.
+        patterns cancel. Cover the lens to measure the dark noise. Where no time is given, each frame may take
+        as long as the exposure of one.
         """
-        deadline = Deadline(self._seconds if seconds is None else seconds)
-        found = {"identity": str(self.connect(deadline.left))}
-        shots = list(self.frames(_CHECKED, deadline.left))
+        deadline = None if seconds is None else Deadline(seconds)
+
+        def left() -> float | None:
+            return None if deadline is None else deadline.left
+
+        found = {"identity": str(self.connect(left()))}
+        shots = list(self.frames(_CHECKED, left()))
         elapsed = (shots[-1].taken - shots[0].taken).total_seconds()
         steps = shots[-1].sequence - shots[0].sequence
         height, width = shots[0].pixels.shape
         found["frames"] = f"{width} × {height}, {steps / elapsed if elapsed > 0 else np.nan:.4g} 1/s"
         found["dropped"] = f"{shots[-1].dropped - shots[0].dropped} of {steps + 1}"
-        found["clock"] = (
-            f"start of exposure within ± {shots[-1].taken_within_s * 1e3:.3g} ms; "
-            + self._exchanged(self._source.clock, "clock", deadline)
-        )
+        with self._exchange("clock", left()) as part:
+            clock = self._source.clock(part)
+        found["clock"] = f"start of exposure within ± {shots[-1].taken_within_s * 1e3:.3g} ms; {clock}"
         before, shortest = self.settings, self._source.dark(self.settings)
         try:
             self.configure(**_differences(before, shortest))
-            one, two = (self.expose(deadline.left).pixels.astype(np.float64) for _ in range(2))
+            one, two = (self.expose(left()).pixels.astype(np.float64) for _ in range(2))
         finally:
             self.configure(**_differences(shortest, before))
         noise = (one - two).std() / np.sqrt(2)
         found["dark"] = f"mean {(one + two).mean() / 2:.3g}, noise {noise:.3g} at the shortest exposure"
         return found
-
-    def _exchanged(self, ask: Callable[[Deadline], str], command: str, deadline: Deadline) -> str:
-        with self._exchange(command, deadline.left) as part:
-            return ask(part)
 
 
 def _writable(features: list[Feature]) -> dict[str, str]:
