@@ -144,6 +144,7 @@ def test_channels_of_arrays_are_told_by_their_order() -> None:
     assert (reseau.read_image(COLOUR, colours="bgr").pixels < one).all()
 
 
+@pytest.mark.slow
 def test_the_lines_of_the_readme_make_of_photographs_a_calibration_its_file_and_its_plot(
     photographs: list[reseau.Frame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -188,6 +189,7 @@ def test_measured_marks_are_shown_written_and_read_back(
         measured.write(tmp_path / "marks.txt")
 
 
+@pytest.mark.slow
 def test_a_scan_in_memory_is_oriented(tmp_path: Path) -> None:
     frame = FilmFrame(3)
     (found,) = reseau.orient(frame.scan(), format_mm=(36.0, 24.0), dpi=frame.dpi)

@@ -219,6 +219,7 @@ def test_predicted_sigmas_and_ellipses_cover_at_their_probability_over_many_tria
     holds(20000)
 
 
+@pytest.mark.slow
 def test_sigma0_is_one_when_the_sigmas_are_true():
     given = covariance("full")
     rng = np.random.default_rng(3)

@@ -74,6 +74,7 @@ def test_elimination_returns_the_failure_of_the_adjustment():
     assert "a with b" in found.reason
 
 
+@pytest.mark.slow
 def test_elimination_drops_at_its_level():
     """A term that is not there survives with probability alpha."""
     alpha, trials = 0.1, 400
@@ -87,6 +88,7 @@ def test_elimination_drops_at_its_level():
     assert abs(survived - alpha * trials) < 4 * np.sqrt(trials * alpha * (1 - alpha))
 
 
+@pytest.mark.slow
 def test_the_f_test_of_nested_models_keeps_its_level_and_finds_what_is_missing():
     alpha, trials = 0.05, 600
     rng = np.random.default_rng(5)
@@ -107,6 +109,7 @@ def test_the_f_test_of_nested_models_keeps_its_level_and_finds_what_is_missing()
 GROUPS = {"fine": np.arange(40) % 2 == 0, "coarse": np.arange(40) % 2 == 1}
 
 
+@pytest.mark.slow
 def test_variance_components_are_the_true_ones_in_the_mean():
     trials = 150
     rng = np.random.default_rng(6)
@@ -160,6 +163,7 @@ def test_invalid_groups_are_errors(groups, words):
         variance_components(polynomial(cubic()), groups)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho", [*slowly(0.3), -0.85])
 def test_variance_components_of_correlated_groups_are_the_true_ones_in_the_mean(rho):
     """Pairs of x and y whose sigmas are 2 and 0.5 times those given, their correlation as given."""

@@ -377,6 +377,7 @@ def test_a_damaged_index_is_reported(tmp_path: Path) -> None:
         assert all(line.startswith("index: ") for line in found.damaged)
 
 
+@pytest.mark.slow
 def test_two_processes_can_write_to_one_archive(tmp_path: Path) -> None:
     script = """
         import sys

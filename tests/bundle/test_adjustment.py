@@ -54,6 +54,7 @@ def test_of_forty_percent_gross_errors_nearly_all_are_found_from_no_approximate_
     assert (result.rejected & ~bad & enough).sum() <= 0.02 * (~bad & enough).sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [0.01, *slowly(0.1), 0.2])
 def test_gross_errors_are_found_with_few_false_rejections(part: float) -> None:
     world = networks.world(images=8, points=60, seed=2, cameras=(SIMPLE,))
@@ -68,6 +69,7 @@ def test_gross_errors_are_found_with_few_false_rejections(part: float) -> None:
     assert 0.85 < result.sigma0 < 1.1
 
 
+@pytest.mark.slow
 def test_gross_errors_that_are_kept_are_named() -> None:
     world = networks.world(images=8, points=60, seed=2, cameras=(SIMPLE,))
     network, bad = disturbed(world.noisy(1), 0.01, 1)
@@ -100,6 +102,7 @@ def test_variance_components_distinguish_rows_from_columns() -> None:
     assert abs(found["rows"] - 1.6) < 3 * found.sigma[1]
 
 
+@pytest.mark.slow
 def test_unnecessary_parameters_are_dropped_and_necessary_ones_kept() -> None:
     cam = networks.camera(free=("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "B1", "B2"))
     values = cam.values.copy()
@@ -156,6 +159,7 @@ def _centred(values: np.ndarray) -> np.ndarray:
     return centred
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("datum", ["control", "free"])
 def test_predicted_covariances_cover(datum: str) -> None:
     """Mean squares of normalised errors of 60 networks; the benchmark has 400 of them."""
@@ -209,6 +213,7 @@ def test_a_mirrored_control_is_found() -> None:
     assert "mirrored" in said(adjust_network(mirrored))
 
 
+@pytest.mark.slow
 def test_two_exchanged_control_points_are_named() -> None:
     world = networks.world(images=8, points=40, control=6, cameras=(SIMPLE,))
     network = world.noisy(1)

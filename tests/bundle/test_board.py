@@ -47,6 +47,7 @@ def chosen(**arguments: float | tuple[float, float] | int) -> BoardChoice:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("warp", "rough", "name"),
     [((0.0, 0.0), 0.0, "flat"), ((0.1, -0.04), 0.0, "warp"), ((0.5, 0.2), 0.1, "free")],

@@ -87,6 +87,7 @@ def test_opencv_and_the_bundle_give_the_same_camera(seen: dict[str, Array]) -> N
     np.testing.assert_allclose(result.fit.values.x0, where, rtol=0, atol=0.05)
 
 
+@pytest.mark.slow
 def test_the_bad_corners_of_left02_are_among_the_rejected(seen: dict[str, Array]) -> None:
     result = adjust_network(network(seen), Options(outliers="reject"))
     assert isinstance(result, Result)

@@ -61,6 +61,7 @@ def chosen(lens: lenses.Lens, more: list[Candidate], **arguments: int) -> ModelC
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("k", "label"),
     [
@@ -203,6 +204,7 @@ def test_a_spline_surface_is_chosen_where_no_polynomial_describes_the_lens() -> 
     assert found.chosen.candidate.label == "opencv: k1"
 
 
+@pytest.mark.slow
 def test_series_are_compared_and_predict_images() -> None:
     frame = ("c", "x0", "y0")
     series = Candidate("brown", (*frame, "K1"), additional="fourier1")

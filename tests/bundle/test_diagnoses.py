@@ -601,6 +601,7 @@ def test_a_control_point_is_not_accused_for_one_of_its_rays() -> None:
     assert Code.DOUBTFUL_CONTROL not in codes, text
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA.exists(), reason="needs the networks of RESEAU_DATA")
 def test_of_control_points_that_no_test_reaches_it_is_said() -> None:
     """Published network of eight misidentified points; the images contradict one of them."""

@@ -38,6 +38,7 @@ def squares(found: list[FieldDifference]) -> np.ndarray:
     return np.array([-np.log(d.p_at) for d in found])
 
 
+@pytest.mark.slow
 def test_normalised_errors_of_the_projection_have_mean_square_one_everywhere(
     against_truth: list[FieldDifference],
 ) -> None:
@@ -158,6 +159,7 @@ def test_a_calibration_file_gives_the_field_of_the_adjustment() -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("datum", [*slowly("control"), "free"])
 @pytest.mark.parametrize("distance", [3.0, 40.0])
 def test_normalised_errors_at_a_distance_have_mean_square_one(datum: str, distance: float) -> None:

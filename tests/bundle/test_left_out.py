@@ -26,6 +26,7 @@ def adjusted(network: Network, free: tuple[str, ...]) -> tuple[float, Informatio
     return result.fit.cost, found, result.fit.values.cameras[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("free", "linear"), [((*FRAME, "K1"), 2e-3), ((*FRAME, "K1", "K2", "P1", "P2"), 0.01), (FRAME, 0.05)]
 )

@@ -65,6 +65,7 @@ def rank_and_size(world: networks.World) -> tuple[int, int]:
     return int(np.argmax(gaps)) + 1, size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("images", "relief", "defect"), [(3, 0.0, 1), (3, 0.3, 0), (4, 0.0, 0)])
 def test_three_photographs_of_a_plane_have_a_rank_defect(images: int, relief: float, defect: int) -> None:
     """Besides the seven of the datum; by derivatives that share nothing with the adjustment."""

@@ -402,6 +402,7 @@ def test_camcal_has_its_published_result_without_initial_poses(published: Callab
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_roma_has_its_published_result(published: Callable[[str], Network]) -> None:
     fit = required(networks.by_itself(published("roma")))
     assert fit.redundancy == 101801

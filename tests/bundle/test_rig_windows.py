@@ -156,6 +156,7 @@ def test_the_same_without_poses() -> None:
     assert np.abs(one.refraction.values - other.refraction.values).max() < 1e-3  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_images_not_taken_at_once_are_left_out_where_the_window_is_on_the_rig() -> None:
     """The window was somewhere else before them."""
     network = wet(0, surface("plane", FREE))

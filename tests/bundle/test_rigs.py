@@ -120,6 +120,7 @@ def test_a_rig_is_a_column_of_the_document() -> None:
     assert np.abs(one.base - other.base).max() < 1e-9  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cold", [False, True])
 def test_an_image_that_was_not_taken_at_once_is_named_and_left_out_of_the_rig(cold: bool) -> None:
     network = drawn(cameras=3, control=True)
@@ -140,6 +141,7 @@ def test_an_image_that_was_not_taken_at_once_is_named_and_left_out_of_the_rig(co
     assert result.sigma0 == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_exposures_that_are_all_shifted_are_no_rig() -> None:
     network = drawn()
     rig = Rig(network.camera_of, (np.arange(len(network.images)) // 2 + network.camera_of) % 8)
@@ -160,6 +162,7 @@ def with_bases(network: Network, *bases: tuple[int, int, float, float]) -> Netwo
     return replace(network, rig=rig, distance_of=np.zeros((0, 2), np.intp), distance=np.zeros((0, 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cold", [False, True])
 def test_a_known_base_gives_the_scale(cold: bool) -> None:
     """Of two cameras that share no exposure: a third connects them."""
@@ -231,6 +234,7 @@ def interior(matrix: Array, distortion: Array) -> Array:
     return np.array([*matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *distortion.ravel()[:5]])
 
 
+@pytest.mark.slow
 def test_a_stereo_pair_is_that_of_opencv_on_the_same_corners(
     reference_data: Callable[[str], Path],
 ) -> None:

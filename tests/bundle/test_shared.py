@@ -59,6 +59,7 @@ def drawn(
     return np.array(ratios), np.array(holding), np.array(formal)
 
 
+@pytest.mark.slow
 def test_for_noise_it_is_the_formal_sigma() -> None:
     ratio, holding, _ = drawn(0.0, refocused)
     assert (np.median(ratio, axis=0) < 1.05).all()
@@ -67,6 +68,7 @@ def test_for_noise_it_is_the_formal_sigma() -> None:
     assert (holding > 1).sum() <= 4
 
 
+@pytest.mark.slow
 def test_it_covers_a_camera_that_refocuses_where_the_formal_one_does_not() -> None:
     _, holding, formal = drawn(2e-3, refocused)
     assert (holding > 1).sum() <= 4

@@ -38,6 +38,7 @@ def cold(lens: Any) -> dict[str, float]:
     return {"fx": f, "fy": f, "cx": (lens.width - 1) / 2, "cy": (lens.height - 1) / 2}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("half_diagonal", "free", "seed"),
     [*(pytest.param(half, FIVE, 2, marks=pytest.mark.slow) for half in (62, 70)), (70, EIGHT, 2)],

@@ -41,6 +41,7 @@ def factored(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
     return found
 
 
+@pytest.mark.slow
 def test_of_an_adjustment_and_its_explanation(factored: list[tuple[str, int]]) -> None:
     with threadpoolctl.threadpool_limits(2, user_api="blas"):
         result = adjust_network(drawn(cameras=3)).required()

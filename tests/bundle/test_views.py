@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from reseau.bundle import Network, adjust_network
 from reseau.bundle.diagnostics.views import views_of
@@ -48,6 +49,7 @@ def test_copies_that_repeat_their_errors_are_one_view() -> None:
         assert len(set(found[0].tolist())) == len(WORLD.network.images)
 
 
+@pytest.mark.slow
 def test_copies_that_have_only_noise_are_views_of_their_own() -> None:
     for seed in range(3):
         network = copied(WORLD.network, 0.0, seed)

@@ -96,6 +96,7 @@ def test_approximate_values_are_found_through_windows(kind: str, control: int) -
         assert np.isfinite(fit.residuals).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_errors_of_all_unknowns_are_within_their_covariances(kind: str) -> None:
     cameras = CALIBRATED if networks.WINDOWS[kind][0].on == "camera" else LENS
@@ -123,6 +124,7 @@ def with_bars(world: networks.World) -> networks.World:
     return replace(world, network=replace(world.network, distance_of=bar, distance=distance))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*slowly("plane port"), "dome"])
 def test_a_free_network_behind_ports_takes_its_scale_from_a_distance(kind: str) -> None:
     world = networks.refracted(networks.world(datum="free", control=0, cameras=LENS), kind, free=())

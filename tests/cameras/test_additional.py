@@ -118,6 +118,7 @@ def test_standard_deviations_are_right_to_five_percent(model: AdditionalModel) -
     assert 0.95 < np.sqrt(normalised(model, range(100, 300)).mean()) < 1.05
 
 
+@pytest.mark.slow
 @FEW
 def test_each_parameter_is_tested(model: AdditionalModel) -> None:
     """From approximate values found by the adjustment; parameters that are not there are not significant."""

@@ -196,6 +196,7 @@ def test_a_model_describes_its_parameters(case: Case) -> None:
         model.mapping(model.start_values(F, GRID), GRID, {"pitch_angle": 1.0})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", cases(quick=("brown", "opencv", "fisheye", "double_sphere")))
 def test_the_model_is_converted_to_itself_and_to_that_of_opencv(case: Case) -> None:
     camera = case.mapping()
@@ -409,6 +410,7 @@ def test_standard_deviations_are_right_to_five_percent(case: Case) -> None:
     assert 0.95 < np.sqrt(joint.mean()) < 1.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", cases(quick=("brown-object",)))
 def test_commands_accept_the_model_and_write_report_and_calibration(
     case: Case, reseau: Run, tmp_path: Path

@@ -126,6 +126,7 @@ def test_names_with_a_grid_are_models() -> None:
         camera_model("splined_stereographic_order=3")
 
 
+@pytest.mark.slow
 def test_corners_without_image_points_are_reported_as_regularised() -> None:
     """Nothing was observed in the lower right; the other parts are determined by the image points."""
     lens = lenses.fisheye(45)

@@ -71,6 +71,7 @@ def test_a_polynomial_that_turns_back_has_no_directions_beyond() -> None:
     assert np.isnan(found[1]).all()
 
 
+@pytest.mark.slow
 def test_a_calibration_of_board_views_is_that_of_opencv() -> None:
     """The same corners, model and noise: the parameters differ by less than a tenth of their sigmas."""
     lens = lenses.fisheye(76)

@@ -49,6 +49,7 @@ def test_the_plan_of_the_paper_has_36_named_recordings() -> None:
     assert [step.position for step in paper_steps(axes=("tilt",))] == [{"tilt": t} for t in (0.0, 30.0, 45.0)]
 
 
+@pytest.mark.slow
 def test_a_plan_stores_frames_verdicts_documents_and_results_that_are_the_same_offline(
     rig: FieldRig, session: Session
 ) -> None:
@@ -256,6 +257,7 @@ def _end_by_signal(rig: FieldRig, number: signal.Signals) -> None:
         time.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_a_stopped_session_is_resumed_with_the_same_result(
     rig: FieldRig, session: Session, tmp_path: Path
 ) -> None:
@@ -325,6 +327,7 @@ def test_a_signal_ends_the_session_although_the_engine_has_lost_the_request_to_p
     assert len(session.frames()) < len(FEW)
 
 
+@pytest.mark.slow
 def test_a_failing_instrument_ends_the_session_without_losses_and_stops_the_others(
     rig: FieldRig, session: Session
 ) -> None:

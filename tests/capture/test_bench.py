@@ -76,6 +76,7 @@ def test_limits_of_the_bench_are_respected() -> None:
     bench.close()
 
 
+@pytest.mark.slow
 def test_the_simulated_bench_works_over_its_real_protocols() -> None:
     with SimulatedBench(seed=2) as simulated:
         with Bench(BenchFile.parse_toml(simulated.toml, where="simulated")) as bench:

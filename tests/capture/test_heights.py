@@ -67,6 +67,7 @@ def test_a_session_stopped_between_heights_is_resumed_with_the_same_result(tmp_p
     assert session.content(session.results()[-1]) == straight.content(straight.results()[-1])
 
 
+@pytest.mark.slow
 def test_the_predicted_gain_of_another_height_is_reached() -> None:
     rig = make_rig()
     live = rig.procedure(sigmas=SIGMAS)

@@ -104,6 +104,7 @@ def test_a_missing_frame_is_requested_again(kept: Session, monkeypatch: pytest.M
     assert kept.results()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("decision", ["resume", "stop"])
 def test_a_series_is_resumed_where_it_was_interrupted(
     kept: Session, monkeypatch: pytest.MonkeyPatch, decision: Decision

@@ -63,6 +63,7 @@ def _modbus(machine: ModbusSensor, script: FaultScript | None = None) -> Device[
     return environment_modbus("air", link, quantities=REGISTERS, answer_s=0.5)
 
 
+@pytest.mark.slow
 def test_conditions_are_stored_with_every_frame_and_summarised_in_the_provenance(tmp_path: Path) -> None:
     rig = FieldRig()
     _with(rig, air=_modbus(ModbusSensor(lambda: AIR | {"temperature": 20.0 + 0.5 * rig.camera.exposures})))
@@ -126,6 +127,7 @@ SENSORS: dict[str, Callable[[], tuple[Machine, Callable[[InProcess], Device[Any]
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["modbus", *(pytest.param(k, marks=pytest.mark.slow) for k in SENSORS if k != "modbus")]
 )

@@ -149,6 +149,7 @@ def test_an_own_plan_starts_without_instruments_that_it_may_not_use(
     assert rig.camera.exposures == 1
 
 
+@pytest.mark.slow
 def test_axes_without_a_reference_are_noticed_before_the_session_begins(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:

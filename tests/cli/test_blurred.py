@@ -131,6 +131,7 @@ def network(path: Path, x0: list[float]) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_network_gives_the_orientation(files, tmp_path: Path, reseau: Run) -> None:
     block = network(tmp_path / "network.json", POSE.x0.tolist())
     status, out, err = reseau(

@@ -69,6 +69,7 @@ def said(status: int, out: str, err: str) -> str:
     return " | ".join(json.loads(out)["warnings"])
 
 
+@pytest.mark.slow
 @PARTS
 def test_gross_errors_are_rejected_and_listed_with_their_test_values(
     part: float, reseau: Run, tmp_path: Path
@@ -98,6 +99,7 @@ def test_gross_errors_are_rejected_and_listed_with_their_test_values(
     assert line in out or k in uncontrolled
 
 
+@pytest.mark.slow
 @PARTS
 def test_gross_errors_that_are_kept_are_named(part: float, reseau: Run, tmp_path: Path) -> None:
     document, rng = block(), np.random.default_rng(7)
@@ -115,6 +117,7 @@ def test_gross_errors_that_are_kept_are_named(part: float, reseau: Run, tmp_path
     assert len(named) == min(8, len(bad))
 
 
+@pytest.mark.slow
 def test_swapped_point_names_are_named_and_rejected(reseau: Run, tmp_path: Path) -> None:
     document = block()
     table = document["observations"]
@@ -170,6 +173,7 @@ def test_an_image_with_two_points_and_a_camera_without_image_are_named(reseau: R
     assert "camera idle has no image" in words
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.0, 0.6])
 def test_variance_components_distinguish_rows_from_columns(rho: float, reseau: Run, tmp_path: Path) -> None:
     """True sigmas of 1.0 and 1.8 times those given, whatever the correlation."""
@@ -187,6 +191,7 @@ def test_variance_components_distinguish_rows_from_columns(rho: float, reseau: R
     assert "y scatters 1." in " ".join(json.loads(out)["warnings"])
 
 
+@pytest.mark.slow
 def test_an_image_with_larger_scatter_is_named_with_its_factor(reseau: Run, tmp_path: Path) -> None:
     document, rng = block(), np.random.default_rng(1)
     table = document["observations"]

@@ -137,6 +137,7 @@ def test_a_key_twice_is_an_error_and_a_byte_order_mark_is_not(reseau: Run, netwo
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not EXPORTS.exists(), reason="needs the networks of RESEAU_DATA")
 @pytest.mark.parametrize(("name", "c"), [("net1-C404Z-2d.txt", 7.4583), ("net4-canon7d-3d.txt", 20.6817)])
 def test_exports_of_photomodeler_as_users_send_them(name: str, c: float, reseau: Run) -> None:

@@ -308,6 +308,7 @@ def photographs(folder: Path) -> list[Path]:
     return files
 
 
+@pytest.mark.slow
 def test_measurements_are_kept_in_a_store_and_not_repeated(
     reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -37,6 +37,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_photographs_end_in_a_folder_with_all_that_is_needed(reseau: Run, photos: Path) -> None:
     status, out, err = reseau("calibrate", photos, "--jobs", 1)
     folder = photos.with_name("photos-calibration")

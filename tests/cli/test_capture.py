@@ -31,6 +31,7 @@ def capture(*arguments: str) -> int:
     return run(["capture", *arguments])
 
 
+@pytest.mark.slow
 def test_a_testfield_from_poses_to_a_calibration_that_can_be_rerun(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:

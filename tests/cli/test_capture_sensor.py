@@ -83,6 +83,7 @@ def frames_of(name: str = "monday") -> list[tuple[str, str]]:
         return [(frame.step, frame.sha256) for frame in archive.session(name).frames(kind="frame")]
 
 
+@pytest.mark.slow
 def test_a_sensor_is_calibrated_on_the_bench(
     asked: list[str], sensor: PixelSensor, capsys: pytest.CaptureFixture[str]
 ) -> None:

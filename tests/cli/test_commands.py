@@ -59,6 +59,7 @@ def test_marks_are_measured_at_their_true_positions(reseau: Run, photo: Any, tmp
     assert np.sqrt((((points.xy - truth) / points.sigma) ** 2).mean()) == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.slow
 def test_json_on_standard_output_is_the_document(reseau: Run, photo: Any, tmp_path: Path) -> None:
     arguments = ("measure", "reseau", photo.image, "-d", photo.design)
     _, out, err = reseau(*arguments, "--json")
@@ -70,6 +71,7 @@ def test_json_on_standard_output_is_the_document(reseau: Run, photo: Any, tmp_pa
     np.testing.assert_allclose(again.xy, document.image_points().xy, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_coordinates_are_accepted_instead_of_an_image(
     reseau: Run, photo: Any, calibration: Path, tmp_path: Path
 ) -> None:

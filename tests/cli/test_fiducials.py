@@ -72,6 +72,7 @@ def test_an_oriented_scan_is_exported_to_micmac_and_metashape(files, tmp_path: P
     assert "--micmac" in err
 
 
+@pytest.mark.slow
 def test_a_camera_is_known_by_its_name_and_written_to_be_edited(files, tmp_path: Path, reseau: Run) -> None:
     status, out, _ = reseau("design", "fiducials")
     assert status == 0

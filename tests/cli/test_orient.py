@@ -32,6 +32,7 @@ def roll(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
     roll: Path, tmp_path: Path, reseau: Run
 ) -> None:
@@ -207,6 +208,7 @@ def test_the_frames_of_a_roll_are_resampled_by_one_command(roll: Path, tmp_path:
     assert "is a folder of orientations; give the folder of the scans" in wrong[2]
 
 
+@pytest.mark.slow
 def test_every_frame_of_a_strip_is_oriented(tmp_path: Path, reseau: Run) -> None:
     frames = [FilmFrame(seed, dpi=300) for seed in range(3)]
     height = min(frame.shape[0] for frame in frames)

@@ -50,6 +50,7 @@ def test_image_coordinates_have_no_overlay(reseau: Run, photo: Any, tmp_path: Pa
     assert "needs an image" in reseau(*arguments)[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("where", "file"), [("o.png", "o.png"), ("all", "all/photo-overlay.png")])
 def test_refine_draws_its_photographs(reseau: Run, photo: Any, tmp_path: Path, where: str, file: str) -> None:
     status, _, err = reseau(
@@ -85,6 +86,7 @@ def test_a_mirrored_frame_is_numbered_as_the_option_says(reseau: Run, photo: Any
     assert found["--not-mirrored"]["A1"][0] < found["--not-mirrored"]["A9"][0]
 
 
+@pytest.mark.slow
 def test_a_rotated_frame_is_found_with_a_larger_maximum(reseau: Run, photo: Any, tmp_path: Path) -> None:
     write_image(tmp_path / "on-its-side.png", np.rot90(np.rint(photo.pixels).astype(np.uint8)).copy())
     arguments = ("measure", "reseau", tmp_path / "on-its-side.png", "-d", photo.design)

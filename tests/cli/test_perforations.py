@@ -38,6 +38,7 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_scale_and_rotation_follow_from_the_perforations(film: Path, reseau: Run) -> None:
     status, out, err = reseau("measure", "perforations", film, *OPTIONS, "--json")
     assert (status, err) == (0, "")

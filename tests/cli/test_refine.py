@@ -136,6 +136,7 @@ def test_a_camera_that_moved_before_photo_iii_is_noticed_and_corrected(bench, tm
         assert abs(_read_true(tmp_path / "true.csv")[name][0] - x) < 0.03
 
 
+@pytest.mark.slow
 def test_a_missing_row_of_pins_a_rotated_object_and_swapped_marks_are_reported(bench, tmp_path, capsys):
     rods = ReseauDesign.read(bench["--test-object"])
     reseau = ReseauDesign.read(bench["--reseau"])

@@ -59,6 +59,7 @@ def photographs(folder: Path) -> list[Path]:
     return sorted(folder.glob("*at*.csv"))
 
 
+@pytest.mark.slow
 def test_a_calibration_estimates_the_axis_of_a_turntable(reseau: Run, measured: Path, tmp_path: Path) -> None:
     status, out, err = reseau(
         "calibrate", *photographs(measured), "-d", measured / "disks.json", *FREE, "-o", tmp_path / "K.json",

@@ -188,6 +188,7 @@ def stack() -> Iterator[ExitStack]:
         yield made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bus", ["v4l2", "gige"])
 def test_frames_are_taken_from_cameras_by_their_drivers(
     bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],

@@ -383,6 +383,7 @@ def test_wrong_input_is_one_line_and_writes_nothing(
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 
+@pytest.mark.slow
 def test_the_program_itself_exits_without_a_traceback(photo: Any, tmp_path: Path) -> None:
     code = f"from reseau.cli import main; main(['measure', 'reseau', 'x.png', '-d', {str(photo.design)!r}])"
     done = subprocess.run(

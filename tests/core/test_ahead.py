@@ -26,6 +26,7 @@ def test_every_loop_of_the_list_is_a_compiled_function_of_as_many_arguments(loop
     assert len(types_of(loop.arguments)) == function.function.__code__.co_argcount
 
 
+@pytest.mark.slow
 def test_loops_are_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     one = next(loop for loop in main_loops() if loop.function.endswith("compiled_filter:filtered"))
@@ -41,6 +42,7 @@ def test_loops_are_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert len(list((tmp_path / "reseau").glob("*.nbc"))) == 1
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_compiled_before_a_job_and_is_then_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -67,6 +67,7 @@ def run(
     return done.stdout.strip()
 
 
+@pytest.mark.slow
 def test_a_loop_is_compiled_once_also_for_a_copy_of_its_file_and_anew_what_was_changed(
     tmp_path: Path,
 ) -> None:
@@ -83,6 +84,7 @@ def test_a_loop_is_compiled_once_also_for_a_copy_of_its_file_and_anew_what_was_c
     assert run(folder, cache) == "3.0 False"
 
 
+@pytest.mark.slow
 def test_processes_that_start_together_compile_a_loop_once(tmp_path: Path) -> None:
     folder, cache = tmp_path / "here", tmp_path / "cache"
     folder.mkdir()
@@ -115,6 +117,7 @@ def test_a_package_that_cannot_be_written_to_is_read_and_the_users_folder_writte
     assert module.folders() == [package / "__pycache__" / "compiled"]
 
 
+@pytest.mark.slow
 def test_machine_code_for_the_usual_processor_is_run_by_this_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -129,6 +132,7 @@ def test_machine_code_for_the_usual_processor_is_run_by_this_one(
     assert run(folder, cache) == "3.0 False"
 
 
+@pytest.mark.slow
 def test_where_nothing_can_be_kept_it_is_compiled_all_the_same(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert run(tmp_path / "here", tmp_path / "file") == "3.0 True"

@@ -38,6 +38,7 @@ def without(hidden: tuple[str, ...], *arguments: object) -> subprocess.Completed
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=240)
 
 
+@pytest.mark.slow
 def test_files_are_measured_without_any_optional_package(tmp_path: Path) -> None:
     design, image = tmp_path / "field.json", tmp_path / "flat.png"
     done = without(OPTIONAL, "design", "testfield", "--out", design)
@@ -60,6 +61,7 @@ def test_a_missing_package_is_one_line(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.pdf"))
 
 
+@pytest.mark.slow
 def test_a_tiff_in_an_unusual_compression_names_the_package_that_decodes_it(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "a.tif", np.zeros((40, 50), np.uint8), compression="zstd")
     tifffile.imwrite(tmp_path / "b.tif", np.zeros((40, 50), np.uint8), compression="lzw")
@@ -104,6 +106,7 @@ uncertainty none.json
 """
 
 
+@pytest.mark.slow
 def test_commands_on_files_need_no_optional_package() -> None:
     code = HIDING.replace(
         "sys.exit(run({arguments!r}))", "[print(words, run(words.split())) for words in {arguments!r}]"

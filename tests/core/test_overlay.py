@@ -25,6 +25,7 @@ def flat(height: int, width: int, level: int) -> np.ndarray:
     return (level + noise).astype(np.uint8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "zoom"), [((60, 90), 14), ((600, 800), 2), ((1200, 1700), 1)])
 @pytest.mark.parametrize("level", [4, 250])
 def test_a_symbol_lies_on_its_pixel_in_frames_of_every_size(
@@ -73,6 +74,7 @@ def test_a_failure_shows_the_frame_and_what_was_found_in_it(tmp_path: Path) -> N
     assert bool(failure) is False
 
 
+@pytest.mark.slow
 def test_the_same_picture_is_drawn_to_the_same_bytes() -> None:
     layers = [Layer("measured, 1", np.array([[30.0, 20.0]]), ("A1",), np.array([1e-4 * np.eye(2)]))]
     first, second = (draw_overlay(flat(60, 90, 9), layers, "a frame") for _ in range(2))

@@ -118,6 +118,7 @@ def test_frames_are_bit_exact_with_their_colour_pattern(device: VideoCamera, nam
         assert bool(shot.raw) == (name in coloured)
 
 
+@pytest.mark.slow
 def test_frames_equal_the_simulated_image() -> None:
     frame = World.standard(seed=5).photo_i()
     device = VideoCamera(SimulatedCamera(StillScene(frame), frame.width, frame.height))

@@ -69,6 +69,7 @@ def camera(simulated: GigeCamera) -> Iterator[Cam]:
         yield made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["Mono8", "Mono16"])
 def test_frames_equal_the_simulated_image(simulated: GigeCamera, name: str) -> None:
     frame = World.standard(seed=5).photo_i()
@@ -82,6 +83,7 @@ def test_frames_equal_the_simulated_image(simulated: GigeCamera, name: str) -> N
         assert shot.full_scale == {"Mono8": 255, "Mono16": 65535}[name]
 
 
+@pytest.mark.slow
 def test_the_camera_images_the_laboratory(simulated: GigeCamera) -> None:
     laboratory = Laboratory(World.standard(seed=5))
     laboratory.expose("screen")  # what takes long is computed now, not while the camera is controlled
@@ -214,6 +216,7 @@ def test_unknown_features_and_invalid_values_raise(
     assert camera.expose().fresh
 
 
+@pytest.mark.slow
 def test_frame_numbers_of_16_bits_wrap_without_a_gap(simulated: GigeCamera, camera: Cam) -> None:
     # The library's camera begins at 65400, and counts 0 too.
     camera.configure(rate=500.0)
@@ -298,6 +301,7 @@ except RefusedError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_camera_controlled_by_another_program_is_refused_before_it_is_set(
     simulated: GigeCamera, camera: Cam
 ) -> None:

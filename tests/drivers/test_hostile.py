@@ -158,6 +158,7 @@ MACHINES: dict[str, Callable[[], Machine]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("machine", MACHINES)
 def test_simulators_report_noise_as_violations(machine: str) -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -47,6 +47,7 @@ def test_a_section_shows_reflectors_at_their_millimetres() -> None:
     assert machine.violations == []
 
 
+@pytest.mark.slow
 def test_the_screen_shows_the_echoes_of_the_scanner() -> None:
     laboratory = Laboratory(World.standard(seed=3))
     dark = laboratory.picture(400, 300).copy()

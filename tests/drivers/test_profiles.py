@@ -144,6 +144,7 @@ def moved(name: str, count: int, seed: int) -> Counter[str]:
     return found + Counter({f"fault: {kind}": n for kind, n in Counter(wire.faults).items()})
 
 
+@pytest.mark.slow
 def test_no_fault_gives_a_wrong_picture_or_waveform() -> None:
     for k, told in enumerate(TOLD):
         endured(told, 12, k)

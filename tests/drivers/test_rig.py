@@ -168,6 +168,7 @@ def test_a_camera_without_a_cable_is_named_and_the_others_are_not_kept_waiting(m
     assert wired.bench["camera 1"].reconnections == 2
 
 
+@pytest.mark.slow
 def test_one_fault_in_a_hundred_frames_never_mixes_exposures(make: Make) -> None:
     scripts = [FaultScript(rate=0.01, seed=k, seconds=0.05) for k in (3, 5)]
     wired = make(2, "action", "action", scripts=scripts)

@@ -223,6 +223,7 @@ def test_the_largest_difference_of_a_fisheye_in_a_polynomial_is_that_between_the
     assert np.linalg.norm(difference, axis=1).max() < 1.05 * done.greatest_px
 
 
+@pytest.mark.slow
 def test_a_fisheye_is_a_spline_surface_for_mrcal(tmp_path: Path) -> None:
     path = file(tmp_path, "mrcal")
     done = export_calibration(wide(), "mrcal", path)

@@ -134,6 +134,7 @@ def test_what_is_written_is_read_back(result: Result, tmp_path: Path, name: str)
     assert abs(size.mean() - np.linalg.norm(result.residuals[kept], axis=1).mean()) < EXACT_PX
 
 
+@pytest.mark.slow
 def test_the_command_exports_and_refuses_other_suffixes(
     result: Result, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -150,6 +151,7 @@ def test_the_command_exports_and_refuses_other_suffixes(
         write_network(result, tmp_path / "block.ply")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "model"),
     [("SIMPLE_RADIAL 1280 960 900 640 480 0.01", "SIMPLE_RADIAL"),

@@ -82,6 +82,7 @@ def test_a_cluster_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch:
         executor_at(cluster="tcp://127.0.0.1:9", store=str(tmp_path))
 
 
+@pytest.mark.slow
 def test_what_the_work_raises_is_raised_at_its_job(executor: Executor) -> None:
     jobs = [(f"j{i}", partial(pow, i, 2)) for i in range(30)]
     jobs[25] = ("bad", partial(operator.truediv, 1, 0))  # type: ignore[arg-type]

@@ -68,6 +68,7 @@ def test_simulated_years(executor: Executor) -> None:
     assert list(benchmark("parts").outcomes(executor, work, cases)) == [work(case) for case in cases]
 
 
+@pytest.mark.slow
 def test_a_part_that_ends_its_process_ends_the_benchmark(executor: Executor) -> None:
     if isinstance(executor, Here):
         pytest.skip("would end this process")

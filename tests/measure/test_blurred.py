@@ -61,6 +61,7 @@ def photograph(noise: float = 1.0, seed: int = 0, focus: float = blurs.FOCUS) ->
     return Frame(image + np.random.default_rng(seed).normal(0.0, noise, image.shape), 255.0)
 
 
+@pytest.mark.slow
 def test_the_place_of_the_corresponding_ray_is_found_where_the_centre_of_density_is_not() -> None:
     found = measure_blurred(photograph(), camera(), ["1"], [target()])
     error = found.xy[0] - blurs.principal_pixel(CENTRE)
@@ -76,6 +77,7 @@ def test_pixels_of_principal_rays_agree_with_those_of_other_rays() -> None:
     assert np.abs(camera().corresponding(points) - other).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_the_focus_is_estimated_with_the_place() -> None:
     frame = photograph(focus=blurs.FOCUS + 0.15)
     focus = Varied(("focus_mm",), (0.2,), lambda by: camera(blurs.FOCUS + by[0]))
@@ -128,6 +130,7 @@ def test_parameters_without_a_standard_deviation_are_refused(
         Varied(names, sigma, lambda by: camera())
 
 
+@pytest.mark.slow
 def test_motion_is_another_cause_of_blur() -> None:
     still = drawn()
     steps = np.arange(-3, 4)

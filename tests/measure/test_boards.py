@@ -83,6 +83,7 @@ def over_sigmas(found: BoardResult, error: Array) -> float:
     return float(np.sqrt((in_sigmas(found, error) ** 2).mean()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("design", "tilt", "turn"),
     [(CHESS, 20.0, 10.0), (CHESS, 50.0, 200.0), (CHARUCO, 25.0, -15.0), (CHARUCO, 45.0, 160.0)],
@@ -200,6 +201,7 @@ def test_few_large_marks_through_a_lens_have_the_sigmas_of_their_errors(
     assert np.sqrt((error**2).mean()) < 0.004
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("design", "printed", "wide", "seed", "nearer"),
     [
@@ -255,6 +257,7 @@ class Action(Wide):
     _lens = (-0.25, 0.075, -0.0003, 0.0003)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [62, *slowly(64)])
 def test_a_lattice_grows_through_the_many_saddles_of_sharpened_edges_behind_a_wide_lens(seed: int) -> None:
     """Where the next corner is expected, edges have saddles that are nearer than the corner."""
@@ -267,6 +270,7 @@ def test_a_lattice_grows_through_the_many_saddles_of_sharpened_edges_behind_a_wi
     assert np.abs(renamed(found, view.truth)).max() < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dictionary", "border", "shape", "size", "motion", "seed", "nearer"),
     [
@@ -314,6 +318,7 @@ def test_a_corner_from_which_sharpening_reaches_beyond_the_frame_is_declined() -
     assert np.abs(in_sigmas(found, error)).max() < 4.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("design", "printed", "seed"),
     [
@@ -352,6 +357,7 @@ def test_corners_on_paper_that_is_saturated_everywhere_are_measured_to_their_sig
     assert 0.8 < over_sigmas(found, error) < 1.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("family", "seed", "light", "least", "low"),
     [
@@ -456,6 +462,7 @@ def test_separate_markers_are_measured_to_the_margin_of_a_wide_view() -> None:
     assert 0.8 < over_sigmas(found, error) < 1.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("condition", "seed"),
     [("gamma", 0), ("motion6", 0), ("overexposed", 0), *slowly(("gamma", 2), ("motion6", 3))],
@@ -563,6 +570,7 @@ def test_a_puzzleboard_has_the_bits_that_its_authors_print() -> None:
     assert (signs[2:9:2, 1:10:2].T > 0).astype(int).tolist() == across
 
 
+@pytest.mark.slow
 def test_a_part_of_a_puzzleboard_has_the_names_of_that_part() -> None:
     frame, truth = puzzle_picture()
     found = measured(frame, PUZZLE)
@@ -590,6 +598,7 @@ def test_another_part_of_the_puzzle_and_its_mirror_image_are_declined() -> None:
     assert mirrored.code is Code.MIRRORED
 
 
+@pytest.mark.slow
 def test_dots_tell_which_part_of_the_code_of_all_puzzleboards_is_seen() -> None:
     frame, truth = puzzle_picture()
     sight = ((truth > 6) & (truth < [frame.width - 7, frame.height - 7])).all(axis=1)
@@ -637,6 +646,7 @@ def test_half_a_chessboard_in_sight_is_measured() -> None:
     assert not [note for note in found.notes if note.code is Code.AMBIGUOUS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("design", "other"),
     [
@@ -671,6 +681,7 @@ def test_a_corner_on_the_border_of_the_frame_is_declined() -> None:
     assert error.max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_part_without_the_ends_of_the_pattern_is_said_to_be_ambiguous() -> None:
     frame, truth = picture(CHESS, 20.0, 10.0)
     part = Frame(frame.pixels[130:290, 150:330], 255.0, "part")
@@ -705,6 +716,7 @@ def test_a_lattice_with_many_corners_missing_beside_it_is_declined() -> None:
         assert isinstance(found, Failure) != placed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "hidden", [*slowly(((slice(120, 260), slice(180, 330)),)), (slice(0, 400), slice(0, 230))]
 )
@@ -721,6 +733,7 @@ def test_something_over_a_part_hides_only_that_part(hidden: tuple[slice, slice])
         assert np.abs(renamed(found, truth)).max() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("design", [CHESS, CHARUCO, CIRCLES], ids=lambda design: design.kind)
 def test_points_beside_a_reflection_have_the_sigmas_of_their_errors(design: BoardDesign) -> None:
     frame, truth = picture(design)
@@ -734,6 +747,7 @@ def test_points_beside_a_reflection_have_the_sigmas_of_their_errors(design: Boar
     assert np.abs(in_sigmas(found, renamed(found, truth))).max() < 4.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("printed", "told"),
     [
@@ -813,6 +827,7 @@ def test_markers_of_every_family_name_the_corners_of_a_charuco_board(dictionary:
     assert np.abs(found.xy - truth).max() < 0.03
 
 
+@pytest.mark.slow
 def test_a_few_markers_beside_a_plane_in_perspective_are_no_other_layout() -> None:
     """As with the distortion of wide lenses: the column of markers at the border lies some pixels aside."""
     frame, truth = picture(CHARUCO)
@@ -861,6 +876,7 @@ def test_a_mirrored_aprilgrid_is_declined() -> None:
     assert found.code is Code.MIRRORED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("design", [CHESS, CHARUCO, CIRCLES, APRIL, MARKERS])
 def test_pictures_of_something_else_are_declined(design: BoardDesign) -> None:
     noise = np.random.default_rng(0).normal(120, 8, (300, 400))
@@ -933,6 +949,7 @@ def test_corners_across_which_edges_of_shadows_run_are_measured_or_declined() ->
     assert 0.75 < over_sigmas(found, error) < 1.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "tone", [pytest.param(30, marks=pytest.mark.slow), 125, 210], ids=["dark", "grey", "as paper"]
 )

@@ -63,6 +63,7 @@ def test_marks_are_measured_within_their_sigmas() -> None:
     assert np.abs(error / sigma).max() < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rotation", "mirrored"), [(90, False), (180, True), (270, False), (0, True)])
 def test_uneven_marks_tell_how_the_film_lies(rotation: int, mirrored: bool) -> None:
     image, places = photograph(UNEVEN, rotation, mirrored)
@@ -120,6 +121,7 @@ def test_a_wrong_resolution_of_the_file_is_said() -> None:
     assert np.abs(found.xy - places).max() < 0.05  # px
 
 
+@pytest.mark.slow
 def test_the_overview_shows_the_thin_lines_of_large_marks(monkeypatch: pytest.MonkeyPatch) -> None:
     cross = FiducialMark(
         polarity="bright", parts=(MarkPart(shape="cross", size=3.9, line_width=0.1),), margin=0.6

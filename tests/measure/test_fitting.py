@@ -146,6 +146,7 @@ def test_the_sigmas_of_targets_may_differ_by_mark_and_axis():
     )
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_repeated_fits():
     model, sigma = families()["camera"], np.array([0.01, 0.03])
     runs = []

@@ -24,6 +24,7 @@ def errors(drawn: Drawn) -> tuple[Array, Array, int]:
     return error[found], points.sigma[nearest][found], len(wanted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", [KINDS[0], *(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS[1:])]
 )
@@ -53,6 +54,7 @@ def test_lines_along_a_wire_that_hides_parts_of_both_ends_are_measured():
     assert np.abs(error / sigma).max() < 4
 
 
+@pytest.mark.slow
 def test_lines_without_a_reseau_are_measured_within_their_sigmas():
     drawn = draw("even", seed=2, wires=False)
     points = find_pins(drawn.frame).points
@@ -62,6 +64,7 @@ def test_lines_without_a_reseau_are_measured_within_their_sigmas():
     assert np.abs(error).max() < 0.1
 
 
+@pytest.mark.slow
 def test_the_blur_of_the_camera_follows_from_the_wires():
     drawn = draw("even", seed=0, turn=0.05, blur=1.2)
     found = blur_of_wires(drawn.frame.pixels.astype(np.float32), drawn.hidden, 1.5)

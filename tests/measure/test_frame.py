@@ -51,6 +51,7 @@ def covered(result: FrameResult, frame: FilmFrame) -> bool:
     return bool((np.abs(errors(result, frame)) < np.maximum(5 * sigma, 0.25)).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "frame",
     [
@@ -76,6 +77,7 @@ def test_corners_are_found_despite_disturbances(frame: FilmFrame) -> None:
     assert np.abs(errors(result, frame)).max() < 0.35
 
 
+@pytest.mark.slow
 def test_corners_of_an_upright_frame_are_named_as_seen() -> None:
     frame = FilmFrame(12, tilt_deg=90.0)
     result = oriented(frame)
@@ -97,6 +99,7 @@ def test_predicted_sigmas_cover() -> None:
     assert 0.65 < np.sqrt(np.mean(np.square(normalised))) < 1.4
 
 
+@pytest.mark.slow
 def test_a_bowed_edge_is_measured_and_its_chord_gives_the_corner() -> None:
     frame = FilmFrame(21, bow_mm=0.15)
     result = oriented(frame)
@@ -126,6 +129,7 @@ def test_a_bright_line_that_leaves_the_edge_is_told_from_it_or_stated() -> None:
     assert max(rival.probability for rival in rivals) > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "frame",
     [
@@ -224,6 +228,7 @@ def test_an_edge_hidden_by_a_line_is_no_unflagged_error_with_the_shape_of_its_ro
     assert covered(found, frame)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "frame",
     [
@@ -272,6 +277,7 @@ def test_a_scratch_parallel_to_an_edge_is_ignored() -> None:
     assert np.abs(errors(result, frame)).max() < 0.35
 
 
+@pytest.mark.slow
 def test_a_frame_cropped_on_one_side_has_three_edges_and_a_sigma_for_the_fourth() -> None:
     frame = FilmFrame(31, crop="right")
     result = oriented(frame)
@@ -315,6 +321,7 @@ def moved_at_its_corners(frame: FilmFrame, by: Array) -> tuple[FrameResult, Arra
     return result, cv2.perspectiveTransform(frame.truth.corners[None], moved)[0]
 
 
+@pytest.mark.slow
 def test_a_frame_seen_at_an_angle_is_oriented_with_a_remark() -> None:
     # Left and right edge converge by two degrees.
     by = np.array([[-14.0, 0.0], [14.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
@@ -336,6 +343,7 @@ def test_four_edges_without_a_perspective_frame_are_declined() -> None:
     assert "do not form a frame" in result.why
 
 
+@pytest.mark.slow
 def test_images_without_a_frame_are_declined_with_a_remedy() -> None:
     rng = np.random.default_rng(0)
     blank = np.full((500, 700), 12, dtype=np.uint8)
@@ -357,6 +365,7 @@ def test_a_wrong_format_is_declined() -> None:
     assert not result
 
 
+@pytest.mark.slow
 def test_the_document_contains_principal_point_axes_and_scale() -> None:
     frame = FilmFrame(51, tilt_deg=3.0)
     document = oriented(frame).document()

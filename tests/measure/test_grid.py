@@ -107,6 +107,7 @@ def test_missing_rows_and_a_hole_do_not_shift_the_names():
     assert (found.candidate[~there] >= 0).mean() < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", [*slowly(0), 8])
 def test_the_places_of_an_uneven_design_tell_which_row_at_the_border_is_not_seen(row):
     """Shifted by a row, as many marks are found, and one row lies largely beyond the frame."""
@@ -123,6 +124,7 @@ def test_the_places_of_an_uneven_design_tell_which_row_at_the_border_is_not_seen
     assert (found.candidate[there] >= 0).all()
 
 
+@pytest.mark.slow
 def test_a_known_handedness_is_kept():
     rng, xy = np.random.default_rng(7), design()
     image = seen(xy)

@@ -107,6 +107,7 @@ def test_a_shift_of_a_thousandth_of_a_pixel_is_measured():
     assert second - first == pytest.approx(0.001, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("polarity", ["dark", "bright"])
 def test_covariances_are_those_of_the_errors(polarity):
     xy, errors = places(), []
@@ -119,6 +120,7 @@ def test_covariances_are_those_of_the_errors(polarity):
     assert np.mean(errors) == pytest.approx(0.0, abs=0.13)
 
 
+@pytest.mark.slow
 def test_known_row_jitter_enters_weights_and_covariances():
     jitter, xy, errors, plain = 0.15, places(), [], []
     for seed in range(20):
@@ -135,6 +137,7 @@ def test_known_row_jitter_enters_weights_and_covariances():
     assert np.sqrt(np.mean(error[..., 1] ** 2)) < np.sqrt(np.mean(blind[..., 1] ** 2))
 
 
+@pytest.mark.slow
 def test_the_noise_model_gives_correct_weights_and_covariances():
     a, b, xy, runs = 0.5, 0.2, places(), {}
     clean = formed("disk", xy, contrast=0.9)

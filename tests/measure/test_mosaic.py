@@ -46,6 +46,7 @@ def errors(frame: Frame, design: BoardDesign, truth: Array) -> tuple[Array, Arra
     return found.xy - truth, sigma
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pattern", FILTERS)
 @pytest.mark.parametrize("kind", DESIGNS)
 def test_boards_behind_filters_are_measured_as_precisely_as_they_say(kind: str, pattern: str) -> None:
@@ -87,6 +88,7 @@ def test_a_raw_file_is_measured_behind_its_filters_as_a_frame_of_a_camera(tmp_pa
     assert np.sqrt(np.mean(error**2)) < 0.012
 
 
+@pytest.mark.slow
 def test_raw_files_are_measured_more_precisely_than_interpolated_and_lose_no_corners(tmp_path: Path) -> None:
     pytest.importorskip("rawpy", reason="no rawpy: pip install reseau[photographs]")
     kept, rms = {}, {}

@@ -142,6 +142,7 @@ def test_wires_that_end_at_the_edge_of_a_screen_are_no_crossings_with_it():
         assert "wrong by about 44 px" in found.notes[0].text
 
 
+@pytest.mark.slow
 def test_names_of_a_part_of_a_regular_grid_are_said_to_be_open():
     frame, crossings = screen_behind_wires()
     design = regular_reseau(11, 7, 10.0, Mark(shape="line-grid", size=0.7, line_width=0.7))
@@ -201,6 +202,7 @@ def plate_in_perspective(tilt_deg: float, pan_deg: float) -> tuple[Array, Array]
     return np.clip(np.rint(grey), 0, 255), at[:, :2] / at[:, 2:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angles", [*slowly(((30.0, 0.0),)), (20.0, 15.0)])
 def test_a_regular_plate_in_perspective_is_not_numbered_a_row_or_column_off(angles):
     # Fields through the marks found first do not reach the last row: shifted by a row, 40 of 48 fit as well.

@@ -128,6 +128,7 @@ def test_positions_reach_the_cramer_rao_bound(along: float, across: float, curva
     assert (np.abs(normalised - 1) < 0.15).all()
 
 
+@pytest.mark.slow
 def test_positions_are_unbiased_and_the_form_is_estimated():
     grid = np.stack(np.meshgrid(60 + 75 * np.arange(6), 55 + 60 * np.arange(5)), axis=-1).reshape(-1, 2)
     truth = grid + np.random.default_rng(1).uniform(-0.5, 0.5, grid.shape)
@@ -210,6 +211,7 @@ def test_nothing_is_found_in_noise():
     assert not find_pins(frame(GROUND + NOISE * rng.standard_normal((300, 400)))).ok.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quality", [*slowly(None), 60])
 @pytest.mark.parametrize("scale", [0.4, *slowly(0.6), 1.0])
 def test_graphics_of_the_instrument_are_not_measured_as_pins(scale: float, quality: int | None):
@@ -331,6 +333,7 @@ def test_missing_shared_and_unknown_rods_are_declined_with_the_reason():
     assert not [note for note in result.notes if note.code is Code.AMBIGUOUS]
 
 
+@pytest.mark.slow
 def test_deviations_far_above_the_sigmas_are_said_if_tolerances_do_not_explain_them():
     matrix = np.diag([5.0, -5.0])
     made = OBJECT + np.random.default_rng(3).normal(0, 0.2, OBJECT.shape)

@@ -39,10 +39,12 @@ def test_at_least_as_many_marks_are_measured_as_by_nasa_s_program(measured, name
     assert result.found >= np.isfinite(case.others["vicar"][:, 0]).sum()
 
 
+@pytest.mark.slow
 def test_at_least_eighty_marks_of_viking_are_measured(measured):
     assert measured(VIKING)[1].found >= 80
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*VOYAGER, FAINT, VIKING])
 def test_marks_agree_with_their_neighbours(measured, name):
     _, result = measured(name)

@@ -47,6 +47,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "case"),
     [
@@ -77,6 +78,7 @@ def test_the_bias_is_below_two_thousandths_of_a_pixel_at_every_subpixel_position
     assert worst < 0.002 + 3.5 * sigma
 
 
+@pytest.mark.slow
 def test_with_known_row_jitter_sigmas_are_not_too_small():
     s = measure_many(small(mark=MARKS["square"], jitter_px=0.1), 10, seed=4)
     # Eight marks of a row share its jitter: 60 groups.
@@ -114,6 +116,7 @@ def test_the_bound_agrees_with_an_independent_estimator():
     assert known_all_else <= bound < 1.2 * known_all_else
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["disk", "cross", *slowly("line-grid")])
 def test_an_absent_mark_is_never_measured_and_the_reason_is_given(shape):
     for seed, sigma in ((0, 2.5), (2, 8.0)):
@@ -175,6 +178,7 @@ def test_a_reseau_of_few_marks_is_measured(columns, rows):
     assert result.rms().shape == (2,)
 
 
+@pytest.mark.slow
 def test_a_design_of_unknown_size_and_unknown_coordinates_of_some_marks():
     formed = form(SMALL, rng(8))
     points = tuple(
@@ -276,6 +280,7 @@ def test_a_frame_without_the_reseau_is_a_failure_with_the_reason(kind, nominal):
         assert "\n" not in result.reason
 
 
+@pytest.mark.slow
 def test_the_wrong_design_is_a_failure():
     formed = form(SMALL, rng(12))
     wrong = replace(SMALL, columns=5, rows=5).design()
@@ -317,6 +322,7 @@ def test_the_same_frame_gives_the_same_bytes():
     assert first == second
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm_px", [7.5, 8.5, 10.0])
 def test_crossings_of_short_arms_reach_the_bound_of_what_lies_near_them(arm_px):
     """Two bars of 2.2 px; the bound of their crossing within 5 px, whatever the ends of the arms are."""

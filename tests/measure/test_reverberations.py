@@ -60,6 +60,7 @@ def test_rods_at_equal_spacings_are_no_reverberations():
     assert (decided(grid, height).of == -1).all()
 
 
+@pytest.mark.slow
 def test_reverberations_in_a_frame_are_declined_with_their_code():
     first = np.stack(np.meshgrid(60 + 90.0 * np.arange(6), 50 + 70.0 * np.arange(5)), axis=-1).reshape(-1, 2)
     truth = np.concatenate([first, np.add(first, [0.0, 18.0])])
@@ -70,6 +71,7 @@ def test_reverberations_in_a_frame_are_declined_with_their_code():
     assert {found.codes[k] for k in rows[len(first) :]} == {Code.REVERBERATION}
 
 
+@pytest.mark.slow
 def test_a_photograph_turned_by_90_degrees_gives_the_same_echoes():
     first = np.stack(np.meshgrid(60 + 90.0 * np.arange(4), 50 + 70.0 * np.arange(3)), axis=-1).reshape(-1, 2)
     upright = frame(picture(first, arcs(len(first), tilt=0.1), (240, 400)))

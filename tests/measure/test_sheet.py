@@ -29,6 +29,7 @@ def measured(formed: sheets.Formed, design: ReseauDesign | None = None) -> Resea
     return result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("roll", "tilt"), [(0.0, 0.0), (100.0, 30.0), (200.0, 45.0), (300.0, 45.0)])
 def test_every_disk_has_its_number_and_its_centre_at_any_rotation_and_tilt(roll: float, tilt: float) -> None:
     formed = sheets.form(sheets.Camera(roll, tilt))
@@ -89,6 +90,7 @@ def test_the_blurred_light_of_a_ring_does_not_shift_the_disk_inside() -> None:
     assert errors_over_sigmas(result, formed.truth)[coded].max() < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grey", [30, 120, 240])
 def test_disks_are_measured_by_what_an_object_in_front_leaves_of_them(grey: int) -> None:
     formed = sheets.form(sheets.Camera(10.0, 20.0))
@@ -169,6 +171,7 @@ def test_every_disk_found_by_another_program_is_measured_with_the_same_number(
     assert np.abs(difference).max() < 0.6
 
 
+@pytest.mark.slow
 def test_a_designed_sheet_is_numbered_at_any_rotation() -> None:
     design = coded_sheet(8, 7, 10.0)
     for roll in (15.0, 105.0, 195.0, 285.0):
@@ -191,6 +194,7 @@ def test_reflections_in_disks_do_not_shift_them() -> None:
     assert np.abs(error).max() < 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kept", [(0,), (1,), (2,), (3,)])
 def test_one_visible_ring_suffices_to_number_a_sheet(kept: tuple[int]) -> None:
     design = coded_sheet(8, 7, 10.0)

@@ -51,6 +51,7 @@ def test_row_jitter_increases_the_bound_of_x_by_a_third() -> None:
     assert np.sqrt(variance[0] / variance[1]) == pytest.approx(1.3, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("station", [*slowly((Station(0),), (Station(45, 90, 180),)), Station(60, 180, 90)])
 def test_targets_are_numbered_and_measured_at_the_cramer_rao_bound(station: Station) -> None:
     bench = FieldBench(seed=11)
@@ -89,6 +90,7 @@ QUICK = (
 """What the suite measures; the others take as long, and are run by `make slow`."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [pytest.param(c, marks=() if c in QUICK else pytest.mark.slow) for c in CASES]
 )
@@ -100,6 +102,7 @@ def test_there_are_no_unflagged_errors(case: str) -> None:
     assert np.nanmax(np.abs(error) / np.hypot(sigma, 0.01)) < 5.0
 
 
+@pytest.mark.slow
 def test_grey_values_that_follow_a_curve_are_linearised_with_a_note() -> None:
     frame, truth = PLAIN.record(STATION), PLAIN.truth(STATION)
     first = answer(frame.pixels)
@@ -112,6 +115,7 @@ def test_grey_values_that_follow_a_curve_are_linearised_with_a_note() -> None:
     assert error < 1.15 * least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gamma", "says"),
     [
@@ -132,6 +136,7 @@ def test_the_curve_that_a_file_states_is_used_unless_targets_contradict_it(gamma
     assert abs(error.mean(axis=0)).max() < 0.002
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("farther", "station", "read"),
     [
@@ -182,6 +187,7 @@ def test_a_board_bend_does_not_affect_the_measurement() -> None:
     assert np.nanmax(np.abs(error)) < 0.05
 
 
+@pytest.mark.slow
 def test_a_frame_of_more_pixels_shows_every_target() -> None:
     camera = Brown(side="object", grid=PixelGrid(480, 480, (0.027, 0.027))).with_values({"c": 57.5})
     sensor = Sensor(480, 480, shot_noise=False, read_noise=1.2)
@@ -261,6 +267,7 @@ def test_images_without_the_testfield_are_failures_with_a_reason(
     assert found.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("left", "right"),
     [
@@ -291,6 +298,7 @@ def test_a_testfield_is_found_beside_a_larger_one_whose_code_begins_alike() -> N
     np.testing.assert_allclose(found.xy - [frames[0].shape[1], 0], alone.xy, rtol=0, atol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("condition", [*slowly("gamma", "sharpened"), "jpeg60"])
 def test_cameras_that_process_their_pictures_leave_sigmas_of_the_size_of_errors(condition: str) -> None:
     """Residuals are then larger than noise, but displace targets less."""

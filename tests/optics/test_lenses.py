@@ -64,6 +64,7 @@ def test_rays_meet_every_surface_where_zemax_printed_them(
 # batoid --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

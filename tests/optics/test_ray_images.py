@@ -194,6 +194,7 @@ def seen_from_the_sensor(lens: ThinLens, target: PlaneTarget, xy: Array) -> Arra
     return np.asarray(seen / all_)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt", [*slowly(0.0), 0.7])
 def test_light_within_a_blurred_image_is_that_seen_from_the_sensor(tilt: float) -> None:
     # Blurred over 25 px; without the change of scale over the stop the image of a target tilted by 0.7 is

@@ -74,6 +74,7 @@ def test_values_are_clipped_to_the_type_and_zero_outside_the_image() -> None:
     assert not shifted[:, 40:].any()
 
 
+@pytest.mark.slow
 def test_memory_is_limited_to_one_band() -> None:
     pixels = np.zeros((3000, 3000), dtype=np.uint16)
     tracemalloc.start()

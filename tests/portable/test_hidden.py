@@ -31,6 +31,7 @@ print(run(["--help"]))
 """
 
 
+@pytest.mark.slow
 def test_every_module_is_imported_without_those_of_posix() -> None:
     done = subprocess.run(
         [sys.executable, "-c", IMPORT_ALL], capture_output=True, text=True, cwd=ROOT, timeout=900, check=False

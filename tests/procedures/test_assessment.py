@@ -128,6 +128,7 @@ def test_a_bent_target_that_is_held_flat_is_no_fault_of_the_photographs() -> Non
     assert calibrated(bent).assessments["camera"].use is Use.MEASUREMENT
 
 
+@pytest.mark.slow
 def test_gross_errors_are_left_out_where_nothing_explains_them_as_well_unless_told() -> None:
     images, rng, wrong = measured(), np.random.default_rng(8), set[tuple[str, str]]()
     for name, points in images[:4]:
@@ -148,6 +149,7 @@ def test_gross_errors_are_left_out_where_nothing_explains_them_as_well_unless_to
     assert found.sigma0 < 1.1
 
 
+@pytest.mark.slow
 def test_points_with_the_names_of_others_are_left_out_and_said() -> None:
     images = measured()
     name, points = images[3]
@@ -172,6 +174,7 @@ def test_the_part_without_points_is_named_and_the_next_photograph_shows_the_targ
     assert then.worst_px < found.corners_px
 
 
+@pytest.mark.slow
 def test_the_predicted_uncertainty_is_that_after_the_photograph_was_taken() -> None:
     images = measured(5, side=40.0)
     before = calibrated(images)
@@ -190,6 +193,7 @@ def test_the_predicted_uncertainty_is_that_after_the_photograph_was_taken() -> N
     assert then.worst_px == pytest.approx(reached, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_model_that_does_not_fit_is_said_so_in_pixels() -> None:
     found = calibrated(measured(k2=0.4), ("fx", "fy", "cx", "cy", "k1")).assessments["camera"]
     assert not found.fits

@@ -46,6 +46,7 @@ def measured() -> BlurredNetwork:
     return found
 
 
+@pytest.mark.slow
 def test_corresponding_rays_are_measured_where_centroids_are_biased() -> None:
     project, found = drawn(), measured()
     last = found.rounds[found.chosen]
@@ -102,6 +103,7 @@ def test_reduced_coordinates_depend_on_the_direction_from_the_projection_centre_
     assert np.abs(reduction[rows]).max() > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [*slowly("centroid"), "edge"])
 def test_ordinary_coordinates_can_be_measured(method: Any) -> None:
     project = drawn()
@@ -193,6 +195,7 @@ def test_the_right_lens_has_no_note() -> None:
     assert not any(note.code == "inconsistent" for note in measured().notes)
 
 
+@pytest.mark.slow
 def test_a_lens_that_is_not_that_of_the_photographs_is_noticed_in_the_images() -> None:
     """A stop that is narrower by a third: the adjustment is better than expected, the images are not."""
     project = drawn()
@@ -206,6 +209,7 @@ def test_a_lens_that_is_not_that_of_the_photographs_is_noticed_in_the_images() -
     assert note.text.startswith("residuals of the targets in i0, i1, i2 are 3.56 to 3.84 times the noise")
 
 
+@pytest.mark.slow
 def test_a_lens_that_images_no_target_as_it_is_fails_with_the_reason() -> None:
     """The front element alone."""
     project = drawn()

@@ -59,6 +59,7 @@ def useless(given: Calibration) -> Calibration:
     return given.model_copy(update={"assessment": assessed})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["fresh", "read"])
 def test_arrays_of_opencv_project_as_the_calibration_does(
     kind: str, done: Calibrated, read: Calibration
@@ -160,6 +161,7 @@ def test_what_is_usable_for_nothing_is_neither_exported_nor_applied(
         read.model_copy(update={"assessment": None}).export(file, to="opencv")
 
 
+@pytest.mark.slow
 def test_a_file_is_written_in_the_format_of_its_suffix(
     done: Calibrated, read: Calibration, tmp_path: Path
 ) -> None:
@@ -192,6 +194,7 @@ def test_maps_show_the_total_error_and_the_formal_one_beside_it(done: Calibrated
     assert figure.get_suptitle() == read.assessment.short
 
 
+@pytest.mark.slow
 def test_several_cameras_are_asked_for_by_name(tmp_path: Path) -> None:
     images, taken = list[tuple[str, ImagePoints]](), dict[str, Taken]()
     xyz = np.column_stack([DESIGN.xy * [1, -1], np.zeros(len(DESIGN.xy))])

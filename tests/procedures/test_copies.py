@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 
 from reseau.core.data import Frame
 from reseau.core.failure import Failure
@@ -25,6 +26,7 @@ def saved_again(frame: Frame, quality: int, name: str) -> Frame:
     return Frame(np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)), 255.0, name)
 
 
+@pytest.mark.slow
 def test_copies_count_once_and_exposures_of_one_pose_do_not() -> None:
     frames = [replace(picture(CHESS, seed=k)[0], name=f"{k}.png") for k in range(3)]
     frames += [replace(frames[0], name="copied.png"), saved_again(frames[1], 90, "saved.jpg")]

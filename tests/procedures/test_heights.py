@@ -76,6 +76,7 @@ def test_errors_of_the_interior_orientation_are_as_large_as_their_sigmas() -> No
     assert abs(np.mean(sigma0) - 1) < 0.01
 
 
+@pytest.mark.slow
 def test_without_heights_the_same_images_do_not_determine_the_principal_distance() -> None:
     seen, heights = recorded(1)
     _, sigma, _ = camera_of(calibrated(seen, heights))

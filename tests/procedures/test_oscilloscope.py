@@ -30,6 +30,7 @@ def refined(world) -> PhotoI:
     return photo
 
 
+@pytest.mark.slow
 def test_a_frame_is_refined_to_a_hundredth_of_a_millimetre(world, refined):
     assert refined.measured is not None
     assert refined.measured.found == 49

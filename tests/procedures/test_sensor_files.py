@@ -103,6 +103,7 @@ def in_dicom(root: Path, levels: dict[tuple[str, float], Frames]) -> Path:
     return root
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", [in_folders, in_stacks, in_a_table, in_a_descriptor, in_dicom])
 def test_every_layout_gives_the_result_of_the_arrays(
     write: Write,

@@ -15,6 +15,7 @@ from reseau.procedures.target_measurement import measured_in_order, measurer_of
 from reseau_sims import FieldBench, Station
 
 
+@pytest.mark.slow
 def test_each_image_is_measured_or_declined_by_name() -> None:
     bench, stations = FieldBench(), (Station(30), Station(45, 90))
     empty = Frame(np.tile(np.arange(240, dtype=np.uint8), (240, 1)), 255.0, "empty")

@@ -53,6 +53,7 @@ def measured(printed: BoardDesign, told: BoardDesign) -> TargetMeasured:
     return measured_as_shown(photographs(printed), told, measurer_of(told))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("printed", "told", "said"),
     [
@@ -174,6 +175,7 @@ def test_a_size_in_another_unit_is_asked_about() -> None:
     assert "0.024 mm (24 µm): is it 0.024 m, which is 24 mm?" in note
 
 
+@pytest.mark.slow
 def test_a_measurer_that_draws_overlays_draws_the_corrected_board(tmp_path) -> None:  # type: ignore[no-untyped-def]
     told = CHESS.model_copy(update={"columns": 6, "rows": 5})
     measure = drawing_overlays(measurer_of(told), {"0.png": tmp_path / "0.png"})

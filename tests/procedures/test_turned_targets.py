@@ -52,6 +52,7 @@ def photographs(design: BoardDesign, print_mm: float, shifted: int = 0) -> list[
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("print_mm", [0.03, *slowly(0.0, 0.15)])
 @pytest.mark.parametrize(
     ("design", "ways"),
@@ -100,6 +101,7 @@ def test_a_target_that_tells_which_way_is_up_is_never_turned(design: BoardDesign
     assert len(ways_to_turn(design)) <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tells", [True, False], ids=["told by the other camera", "told by none"])
 def test_names_that_are_not_certain_are_those_that_the_other_camera_of_a_rig_predicts(tells: bool) -> None:
     design, rng = board("chess", 8, 10, 20.0), np.random.default_rng(5)

@@ -30,6 +30,7 @@ from worlds import prints
 from worlds.sheets import View, pose
 
 
+@pytest.mark.slow
 def test_a_charuco_board_is_found_among_other_targets() -> None:
     charuco = board("charuco", 7, 6, 24.0)
     frame, _ = picture(charuco)
@@ -55,6 +56,7 @@ def test_a_lattice_that_few_photographs_show_is_said_where_no_target_is_found() 
     assert "seen; the photographs show a lattice of 7 × 6 squares without markers; describe" in found.reason
 
 
+@pytest.mark.slow
 def test_all_targets_that_fit_alike_are_named() -> None:
     frame, _ = picture(board("chess", 7, 6, 24.0))
     found = which_target(
@@ -88,6 +90,7 @@ def test_where_a_lattice_is_seen_no_testfield_is_looked_for(tried: list[str]) ->
     assert set(tried) == {"chess", board("chess", 9, 8, 24.0).name}
 
 
+@pytest.mark.slow
 def test_lines_are_not_looked_for_where_markers_are_read(tried: list[str]) -> None:
     charuco = board("charuco", 7, 6, 24.0, name="mine")
     frame, _ = picture(charuco)

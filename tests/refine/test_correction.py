@@ -236,6 +236,7 @@ def test_the_covariance_of_model_and_corrected_marks_is_that_of_repeated_measure
     assert np.mean(passed) == pytest.approx(0.95, abs=0.07)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "lost", [(), (GRID.origin,), *slowly(((GRID.axis,),))], ids=["all", "without O", "without S"]
 )

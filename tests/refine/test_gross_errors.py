@@ -41,6 +41,7 @@ def true_of(rods: ImagePoints, seed: int = 1) -> tuple[Array, tuple[str, ...], t
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["origin", *slowly("axis", "inner"), "several"])
 def test_wrong_rods_are_left_out_and_named_also_those_that_define_the_axis(which: str):
     m, n = RODS.ids[0], RODS.ids[6]

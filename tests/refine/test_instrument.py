@@ -119,6 +119,7 @@ def test_absent_coefficients_are_dropped_and_the_datum_is_kept():
     assert found.covariance.shape == (len(camera.model.names) + len(INSTRUMENT.names),) * 2
 
 
+@pytest.mark.slow
 def test_a_required_local_model_is_applied_and_stored_in_the_calibration():
     rng = np.random.default_rng(8)
     camera = correct_camera(reseau_marks(rng), RESEAU, trials=0).required()

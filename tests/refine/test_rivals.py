@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from reseau.core.data import ImagePoints
 from reseau.core.failure import Failure
@@ -50,6 +51,7 @@ def test_the_polynomials_are_preferred_if_they_are_the_true_model():
     assert rivals(RationalPolynomial.ultrasonic(), wong_display(), points, target).verdict == "first"
 
 
+@pytest.mark.slow
 def test_if_both_are_true_neither_is_preferred_more_often_than_the_level():
     true = wong_display().with_values({"k1": 1e-6, "P2": 1e-5, "P3": 0.005})
     verdicts = [

@@ -75,6 +75,7 @@ def bundle_page() -> str:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bundle", "oscilloscope", "applied"])
 def test_a_page_has_named_pictures_headings_in_order_and_nothing_from_outside(
     bench: Bench, kind: str
@@ -141,6 +142,7 @@ def test_the_distortion_of_a_wide_lens_is_drawn_by_the_angle() -> None:
     assert 80 < at[-1] < 90
 
 
+@pytest.mark.slow
 def test_powers_of_ten_stand_with_each_number_and_options_that_were_not_given_are_not_listed() -> None:
     macros = environment().get_template("_macros.html.j2").module
     cells = re.findall(r"<td>(.*?)</td>", str(macros.quantity(power(5.882e-4, 1.0e-5))))  # type: ignore[attr-defined]
@@ -156,6 +158,7 @@ def test_powers_of_ten_stand_with_each_number_and_options_that_were_not_given_ar
     assert "<dt>row jitter</dt><dd>0.0</dd>" in listed
 
 
+@pytest.mark.slow
 def test_the_first_screen_has_camera_days_version_verdict_map_and_every_photograph() -> None:
     result = adjust_network(example_network()).required()
     assessed = assess(result)

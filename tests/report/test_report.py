@@ -112,6 +112,7 @@ def numbers(cells: list[str]) -> list[float]:
     return [float(cell.replace("\u2212", "-")) for cell in cells]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whole", [False, True])
 def test_the_page_needs_no_other_files_and_is_well_formed(bench: Bench, whole: bool) -> None:
     page = whole_page(bench) if whole else first_page(bench)
@@ -218,6 +219,7 @@ def test_the_page_contains_the_numbers_of_the_comparison_for_each_factor(bench: 
     )
 
 
+@pytest.mark.slow
 def test_without_the_truth_only_rods_are_listed(bench: Bench) -> None:
     page = whole_page(bench, with_truth=False)
     assert "simulated" not in page
@@ -271,6 +273,7 @@ def test_a_photograph_without_its_predecessors_is_refused(bench: Bench) -> None:
         oscilloscope_report(bench.first, bench.world.design, bench.second)
 
 
+@pytest.mark.slow
 def test_the_overview_is_small_and_reproducible_to_the_byte(bench: Bench) -> None:
     pixels = np.random.default_rng(2).integers(0, 255, (1200, 1600)).astype(np.uint8)
     frames = 3 * (Frame(pixels, 255.0),)

@@ -32,6 +32,7 @@ def result() -> SensorResult:
     return with_edge(calibrate_sensor(SensorSeries(dark, light, sensor.full_scale)), frames)
 
 
+@pytest.mark.slow
 def test_the_report_contains_all_results_and_is_reproducible_to_the_byte() -> None:
     provenance = Provenance({"edge 00 000": "ab" * 32}, {})
     page = sensor_report(result(), title="Sensor", provenance=provenance)

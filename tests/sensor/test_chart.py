@@ -74,6 +74,7 @@ def test_neighbours_closer_than_ten_pixels_are_declined() -> None:
     assert isinstance(found, Failure)
 
 
+@pytest.mark.slow
 def test_the_command_writes_documents_and_pictures(
     squares: Array, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

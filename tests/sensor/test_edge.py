@@ -72,6 +72,7 @@ def check(kind: str, count: int, within: tuple[float, float], bias: float) -> No
     assert np.abs(np.sqrt(np.mean(reported**2, axis=0)) - 1).max() < max(4 / np.sqrt(2 * count), 0.42), kind
 
 
+@pytest.mark.slow
 def test_the_free_curve_is_true_within_its_sigmas() -> None:
     check("coma", 8, (0.7, 1.35), 1.8)
 
@@ -86,6 +87,7 @@ def test_the_free_curve_is_true_within_its_sigmas_over_many_edges(kind: str) -> 
     assert 0.5 < np.sqrt((over**2).mean(axis=0)).min() < np.sqrt((over**2).mean(axis=0)).max() < 1.33
 
 
+@pytest.mark.slow
 def test_with_little_noise_there_is_no_bias() -> None:
     for kind in KINDS:
         edge = edge_of(kind, np.random.default_rng(7), decibels=100.0)
@@ -121,6 +123,7 @@ def test_the_tests_keep_their_levels_over_many_edges() -> None:
             assert abs((p < level).sum() - expected) < 3.5 * scatter, level
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*slowly("defocus"), "flare", "coma"])
 def test_a_non_gaussian_edge_is_reported(kind: str) -> None:
     for seed in range(3):
@@ -130,6 +133,7 @@ def test_a_non_gaussian_edge_is_reported(kind: str) -> None:
         assert {test["name"]: test["passed"] for test in found.tests()}["Gaussian edge"] is False
 
 
+@pytest.mark.slow
 def test_a_bent_edge_is_detected_and_modelled() -> None:
     bow, over, curves = 4e-4, [], []
     sag = bow * 24**2
@@ -163,6 +167,7 @@ def test_an_edge_blurred_only_by_the_pixels_is_measured() -> None:
     assert 0.7 < rms(np.array(over)) < 1.3
 
 
+@pytest.mark.slow
 def test_known_noise_determines_the_weights() -> None:
     over = []
     for seed in range(8):

@@ -38,6 +38,7 @@ def calibrated(seed: int) -> tuple[PixelSensor, SensorResult]:
     return sensor, calibrate_sensor(series(sensor, rng))
 
 
+@pytest.mark.slow
 def test_the_truth_is_recovered_within_its_sigmas() -> None:
     errors: dict[str, list[float]] = {}
     for seed in range(40):

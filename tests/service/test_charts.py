@@ -91,6 +91,7 @@ def ar1(rng, shape, phi, degrees=np.inf):
     return x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("phi", "before", "degrees"),
     [
@@ -209,6 +210,7 @@ def warm(rng, runs=80, step=4.0):
     return np.where(np.arange(runs) < runs // 2, 20.0, 20.0 + step) + rng.normal(0.0, 1.0, runs)
 
 
+@pytest.mark.slow
 def test_a_change_with_temperature_is_explained_and_drift_beside_it_is_not():
     explained, drift = [], []
     for seed in range(8):

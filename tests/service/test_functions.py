@@ -46,6 +46,7 @@ def warm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_function_is_fitted_evaluated_and_budgeted_from_the_command_line(
     warm: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -81,6 +82,7 @@ def test_what_sensors_recorded_serves_as_a_table_of_covariates(
     assert "recorded nothing as dew" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_points_measured_at_an_uncertain_temperature_share_its_error(warm: Path) -> None:
     """Their covariance is that of drawn temperatures."""
     with Archive.open(warm / "archive") as archive:

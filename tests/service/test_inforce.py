@@ -342,6 +342,7 @@ def test_a_session_is_the_origin_only_of_calibrations_among_its_results(archive:
     assert known.decision("left", first).session is None
 
 
+@pytest.mark.slow
 def test_a_creeping_drift_is_announced_and_held_back_and_counts_from_the_reference(archive: Archive) -> None:
     known, _ = started(archive)
     rng, made = np.random.default_rng(5), []
@@ -368,6 +369,7 @@ def test_a_creeping_drift_is_announced_and_held_back_and_counts_from_the_referen
     assert known.decide("left", camera(**values, name="again"), RULES, since=day(91)).outcome != "rejected"
 
 
+@pytest.mark.slow
 def test_a_season_is_told_beside_a_trend_until_it_has_turned(archive: Archive) -> None:
     known, _ = started(archive)
     rng, said = np.random.default_rng(5), list[str]()
@@ -382,6 +384,7 @@ def test_a_season_is_told_beside_a_trend_until_it_has_turned(archive: Archive) -
     assert not any(said[13:])
 
 
+@pytest.mark.slow
 def test_a_stable_camera_is_accepted(archive: Archive) -> None:
     known, _ = started(archive)
     rng, found = np.random.default_rng(6), []

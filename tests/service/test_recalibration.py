@@ -92,6 +92,7 @@ def test_a_recalibration_is_acquired_adjusted_compared_and_put_in_force(
         assert made["by"] == f"{getpass.getuser()}, recalibration left"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_the_steps_of_a_recalibration_follow_one_another_to_the_certificate(
     rig: FieldRig, mailbox: tuple[str, list[Any]], capsys: pytest.CaptureFixture[str]
@@ -117,6 +118,7 @@ def test_the_steps_of_a_recalibration_follow_one_another_to_the_certificate(
     assert str(made.session) in body(mailbox[1][0])
 
 
+@pytest.mark.slow
 def test_a_recalibration_that_stops_is_continued_where_it_stopped(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -144,6 +146,7 @@ def test_a_recalibration_that_stops_is_continued_where_it_stopped(
     assert "has no session that can be continued" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_schedule_carries_out_what_is_due_once_and_exports_a_calendar(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -171,6 +174,7 @@ def test_a_schedule_carries_out_what_is_due_once_and_exports_a_calendar(
     assert "needs a review" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_bench_in_use_blocks_the_run_and_nothing_is_begun(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -221,6 +225,7 @@ def test_impossible_requests_are_refused_in_one_line(
     assert len(error.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_daemon_ends_when_it_is_asked_to(tmp_path: Path) -> None:
     Archive.open(tmp_path / "archive", create=True).close()
     code = "import sys; from reseau.cli import run; sys.exit(run(sys.argv[1:]))"
@@ -263,6 +268,7 @@ def body(message: Any) -> str:
     return "".join(each.get_payload(decode=True).decode() for each in parts)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("way", ["address", "name", "redirect", "rebinding"])
 def test_alarms_reach_no_address_inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
@@ -442,6 +448,7 @@ with Archive.open(place) as archive:
 """
 
 
+@pytest.mark.slow
 def test_two_services_on_one_archive_send_each_alarm_once(tmp_path: Path) -> None:
     place, day = tmp_path / "archive", timedelta(days=1)
     command = [sys.executable, "-c", _SENDER, place]

@@ -283,6 +283,7 @@ def test_a_lease_is_renewed_as_long_as_the_run_goes_on(tmp_path: Path) -> None:
         assert short.runs("weekly")[0].state == "done"
 
 
+@pytest.mark.slow
 def test_a_bench_in_use_blocks_a_run_which_starts_again_in_its_window(schedules: Schedules) -> None:
     def busy(*_: object) -> str:
         raise StateError("is in use", where="camera")

@@ -37,6 +37,7 @@ def archive(tmp_path: Path) -> Archive:
     return Archive.open(tmp_path / "archive", create=True)
 
 
+@pytest.mark.slow
 def test_a_program_captures_and_reruns_a_session(archive: Archive) -> None:
     rig, given = FieldRig(), {"design.json": DESIGN.to_json()}
     conducting.check("monday", "testfield", TESTFIELD, given, rig.bench)
@@ -50,6 +51,7 @@ def test_a_program_captures_and_reruns_a_session(archive: Archive) -> None:
     assert conducting.calibration_of(session).parameters["c"].unit == "mm"
 
 
+@pytest.mark.slow
 def test_the_report_of_a_session_lists_the_frames_that_were_left_out(archive: Archive) -> None:
     away = [["edge on", {"tilt": 88.0, "roll": 0.0, "camera_roll": 0.0}]]
     given = {"design.json": DESIGN.to_json()}
@@ -63,6 +65,7 @@ def test_the_report_of_a_session_lists_the_frames_that_were_left_out(archive: Ar
     assert declined.why in html.unescape(page)
 
 
+@pytest.mark.slow
 def test_a_rerun_does_not_import_the_command_line() -> None:
     code = """
         import sys

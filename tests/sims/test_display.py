@@ -45,6 +45,7 @@ def test_derivatives_and_inverse(mapping: PlaneMapping) -> None:
     np.testing.assert_allclose(mapping.inverse(mapping(POINTS)), POINTS, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_random_tube_has_thirteen_parameters_and_distorts_by_millimetres() -> None:
     world = World.standard(0)
     instrument = Instrument(world.display.correction, world.scanner.m1, world.scanner.m2)
@@ -75,6 +76,7 @@ def plain(**settings: float) -> Display:
     return Display(identity, grain=0.0, gradient=(0.0, 0.0), falloff=0.0, **settings)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_black_has_a_glow_and_white_is_brighter_by_the_contrast() -> None:
     screen, display = Screen(), plain(glow=40.0, contrast=150.0)
     for signal, grey in ((0.0, 40.0), (0.5, 115.0), (1.0, 190.0)):
@@ -84,6 +86,7 @@ def test_black_has_a_glow_and_white_is_brighter_by_the_contrast() -> None:
         assert middle.mean() == pytest.approx(grey, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_raster_lines_are_visible_depending_on_the_spot_size() -> None:
     screen = Screen()
     for spot in (0.12, 0.18, 0.22):

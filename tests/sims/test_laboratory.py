@@ -64,6 +64,7 @@ def centre_of_target(frame: Frame, near: Array) -> Array:
     return np.array([column + dark.sum(0) @ offset / dark.sum(), row + dark.sum(1) @ offset / dark.sum()])
 
 
+@pytest.mark.slow
 @pytest.mark.client("zaber-motion", "Zaber chain, TCP", "poses of the testfield before the camera")
 def test_zaber_motion_moves_the_testfield_that_the_camera_sees() -> None:
     ascii_ = pytest.importorskip("zaber_motion.ascii", reason="zaber-motion is not installed")
@@ -105,6 +106,7 @@ def _alone(xy: Array) -> list[int]:
     return [int(k) for k in np.flatnonzero(inside & (gap.min(axis=1) > 5.0))]
 
 
+@pytest.mark.slow
 def test_our_driver_moves_it_over_a_serial_line_and_a_frame_is_what_was_predicted() -> None:
     with moving(PtyServer) as (laboratory, chain, server):
         plans = {name: {"device": d, "axis": a, "per_unit": 1000.0} for name, (d, a) in AXES.items()}
@@ -143,6 +145,7 @@ def test_a_moving_table_is_imaged_at_its_current_position() -> None:
     assert laboratory.field_truth().pose.x0[0] != 0.0
 
 
+@pytest.mark.slow
 def test_light_exposure_and_gain_act_as_specified_and_saturate() -> None:
     time = [0.0]
     laboratory = Laboratory(World.standard(seed=1), room=Room(light_per_hour=-0.1), clock=lambda: time[0])
@@ -168,6 +171,7 @@ def test_the_camera_drifts_with_time() -> None:
     assert np.median(moved, axis=0) == pytest.approx([-2 * PX / 5000, 0.0], abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_laboratory_and_frames() -> None:
     one, two = (Laboratory(World.standard(seed=8), clock=lambda: 0.0) for _ in range(2))
     assert one.room == two.room != Laboratory(World.standard(seed=9)).room

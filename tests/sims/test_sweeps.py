@@ -48,6 +48,7 @@ def test_middles_of_arcs_are_at_their_true_positions(seed: int, display: str) ->
     assert np.abs(found[:, 1]).max() < 0.006
 
 
+@pytest.mark.slow
 def test_a_body_is_at_its_true_position_inside_the_rods() -> None:
     world = quiet(World.standard(4))
     body, truth = world.body(20), world.truth_iii(world.body(20))
@@ -69,6 +70,7 @@ def test_the_true_mapping_and_its_inverse_agree(world: World) -> None:
     assert names[0] == "P1"
 
 
+@pytest.mark.slow
 def test_rods_deviate_from_the_design_by_their_tolerance() -> None:
     designed = test_object()
     deviation = np.concatenate([World.standard(seed).rods.xy - designed.xy for seed in range(12)])
@@ -99,6 +101,7 @@ def test_the_same_seed_gives_the_same_photographs_in_any_order(world: World, pho
     assert len({world.photo_i().sha256, photo_ii.sha256, iii.sha256}) == 3
 
 
+@pytest.mark.slow
 def test_photo_ii_is_dark_with_bright_arcs_and_visible_wires(world: World, photo_ii: Frame) -> None:
     grey = photo_ii.pixels.astype(float)
     assert photo_ii.pixels.dtype == np.uint8
@@ -254,6 +257,7 @@ class Inverse:
         return self.path.inverse(xy)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("impossible", "message"),
     [

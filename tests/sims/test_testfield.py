@@ -29,6 +29,7 @@ def test_the_pixel_footprint_is_that_of_the_paper() -> None:
     assert step / 30.0 == pytest.approx(57.5 / 5000 / 0.027, abs=0.002)
 
 
+@pytest.mark.slow
 def test_the_same_seed_and_station_give_the_same_frame_in_any_order() -> None:
     bench, station = FieldBench(seed=3), Station(30, 90)
     first = bench.record(station)
@@ -104,6 +105,7 @@ def test_the_lens_distortion_at_the_middle_of_an_edge_is_as_requested() -> None:
     np.testing.assert_allclose(bent.camera(at) - plain.camera(at), [[-10.0, 0.0]], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_stains_hide_or_saturate_targets_and_a_mirror_reflects_the_field() -> None:
     plain = FieldBench(sensor=QUIET)
     stained = replace(plain, stains=(Stain(60, 50, 20, 90.0), Stain(180, 190, 12, 300.0, opaque=False)))

@@ -35,6 +35,7 @@ def test_the_same_seed_gives_the_same_frame_in_any_order(world: World, frame: Fr
     assert World.standard(4).photo_i().sha256 != frame.sha256
 
 
+@pytest.mark.slow
 def test_two_photographs_differ_only_by_noise(world: World, frame: Frame) -> None:
     other = world.photograph("PHOTO I again")
     difference = other.pixels.astype(float) - frame.pixels
@@ -82,6 +83,7 @@ def test_wires_are_drawn_at_their_true_positions(world: World) -> None:
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("turn_deg", "slope"), [(-8.0, 0.1), *slowly((2.0, 0.003), (90.0, 0.02))])
 def test_uneven_wires_cross_at_the_marks_of_their_design(turn_deg: float, slope: float) -> None:
     rng = np.random.default_rng(5)
@@ -105,6 +107,7 @@ def test_uneven_wires_cross_at_the_marks_of_their_design(turn_deg: float, slope:
         assert window[16, 16] > 0.7 * uneven.plate.opacity
 
 
+@pytest.mark.slow
 def test_a_broken_crossing_of_uneven_wires_leaves_a_gap() -> None:
     wires = uneven_wires(np.random.default_rng(5), 9, 7, 14.0, turn_deg=5.0)
     uneven = World.standard(3, wires=wires, faults=Faults(missing=2))
@@ -126,6 +129,7 @@ def design_of(mark: Mark, polarity: str) -> ReseauDesign:
     return regular_reseau(5, 4, 25.0, mark, polarity=polarity)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("polarity", ["dark", "bright"])
 @pytest.mark.parametrize(
     "mark",

@@ -119,6 +119,7 @@ def test_noise_does_not_raise(name: str, garbage: list[bytes]) -> None:
             assert found is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["zaber", "ping", "bk", "apt", "modbus-rtu"])
 @given(garbage=st.binary(max_size=100), data=st.data())
 def test_decoders_recover_after_noise(name: str, garbage: bytes, data: st.DataObject) -> None:

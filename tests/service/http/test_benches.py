@@ -164,6 +164,7 @@ def one(rig: Rig) -> Iterator[Served]:
         yield found
 
 
+@pytest.mark.slow
 def test_an_axis_is_moved_within_its_limits_and_recorded(one: Served, rig: Rig) -> None:
     client = one.client("operate")
     moved = client.post(f"{BENCH}/move", json={"axis": "tilt", "position": 3.0})
@@ -281,6 +282,7 @@ def begin(client: TestClient, name: str) -> Any:
     return client.post(f"{BENCH}/sessions", json=given)
 
 
+@pytest.mark.slow
 def test_a_session_is_begun_paused_continued_and_calibrated(one: Served) -> None:
     client = one.client("operate")
     assert begin(client, "paused").status_code == 201
@@ -340,7 +342,7 @@ def test_a_plan_of_the_user_is_not_run_and_a_wrong_one_refused(one: Served) -> N
     client = one.client("operate")
     own = {"name": "own", "plan": "own", "parameters": {}, "inputs": {"generator.py": "import os"}}
     assert client.post(f"{BENCH}/sessions", json=own).status_code == 422
-    twice = client.post(f"{BENCH}/sessions", json={"name": "paused", "plan": "frames"})
+    twice = client.post(f"{BENCH}/sessions", json={"name": "by form", "plan": "frames"})
     assert (twice.status_code, twice.json()["error"]["what"]) == (422, "is the name of another session")
     wrong = {"name": "wrong", "plan": "frames", "parameters": {"count": -1}}
     assert client.post(f"{BENCH}/sessions", json=wrong).status_code == 422
@@ -462,6 +464,7 @@ def test_the_worker_answers_only_with_certificates(tmp_path: Path) -> None:
         assert ("hello" in outcome[0]) == (role == "own")
 
 
+@pytest.mark.slow
 def test_an_instrument_that_does_not_answer_is_named_and_does_not_take_the_others_with_it(
     rig: Rig, tmp_path: Path
 ) -> None:
@@ -549,6 +552,7 @@ def test_positions_are_reported_while_an_axis_moves_and_who_moves_it(one: Served
     client.post(f"{BENCH}/move", json={"axis": "roll", "position": 0.0})
 
 
+@pytest.mark.slow
 def test_a_worker_whose_service_has_gone_ends_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

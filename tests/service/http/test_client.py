@@ -29,6 +29,7 @@ def place(archived: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         yield folder, address, token
 
 
+@pytest.mark.slow
 def test_sessions_and_files_are_read(place: tuple[Path, str, str]) -> None:
     with Client(place[1], place[2]) as client:
         assert [each["name"] for each in client.sessions()] == ["monday"]

@@ -197,6 +197,7 @@ def test_a_one_time_password_is_accepted_once(accounts: tuple[Accounts, Clock]) 
         found.confirm_code("Ada", code_of(secret, clock, 1))  # nothing is prepared
 
 
+@pytest.mark.slow
 def test_of_60_guesses_at_once_ten_are_considered(one: Served) -> None:
     with ThreadPoolExecutor(60) as many:
         found = Counter(many.map(lambda k: try_to(one, "Ada", f"guess {k} guess").status_code, range(60)))

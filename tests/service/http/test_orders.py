@@ -51,6 +51,7 @@ def ended(client: TestClient, number: int) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 def test_recalibrate_now_runs_on_the_bench_of_the_service_with_its_log(defined: Served) -> None:
     client = defined.client("operate")
     assert client.get(ORDERS).json()["recalibrations"] == ["left"]
@@ -134,6 +135,7 @@ class Clock:
         return self.now
 
 
+@pytest.mark.slow
 def test_an_order_that_finds_an_instrument_not_ready_is_tried_again_each_time_later(tmp_path: Path) -> None:
     clock, waits = Clock(), list[float]()
     with Archive.open(tmp_path / "archive", create=True, clock=clock) as archive:
@@ -157,6 +159,7 @@ def test_an_order_that_finds_an_instrument_not_ready_is_tried_again_each_time_la
         assert orders.get(number).state == "failed"
 
 
+@pytest.mark.slow
 def test_an_order_whose_worker_ended_is_continued_by_the_next(tmp_path: Path) -> None:
     with Archive.open(tmp_path / "archive", create=True) as archive:
         orders = Orders(archive, "cellar")

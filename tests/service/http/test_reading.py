@@ -50,6 +50,7 @@ def filled(path: str) -> str:
     return re.sub(r"\{(number|figure)\}", "1", re.sub(r"\{(session|name|key|bench)\}", "x", path))
 
 
+@pytest.mark.slow
 def test_every_operation_refuses_nobody_a_wrong_token_and_too_weak_a_token(one: Served) -> None:
     nobody, wrong, weak = one.client(""), one.client(""), one.client("read")
     wrong.headers["Authorization"] = "Bearer reseau_wrong"
@@ -231,6 +232,7 @@ def test_any_two_calibrations_are_compared(client: TestClient) -> None:
     assert "left: " in client.get("/compare").text
 
 
+@pytest.mark.slow
 def test_drift_is_charted_and_an_alarm_until_it_is_acknowledged(one: Served) -> None:
     client = one.client("operate")
     found = client.get(f"{LEFT}/drift").json()

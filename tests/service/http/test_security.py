@@ -191,6 +191,7 @@ def test_the_body_of_a_request_is_not_read_for_nobody(one: Served) -> None:
     assert one.client("").post("/api/1/login", content=b"x" * 20_000).status_code == 413
 
 
+@pytest.mark.slow
 def test_requests_that_arrive_too_slowly_and_connections_without_any_are_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
