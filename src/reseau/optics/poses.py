@@ -291,6 +291,22 @@ class Projection(NamedTuple):
     d_camera: Array
 
 
+def seen_by(camera: PlaneMapping, points: Array) -> tuple[Array, Array, Array]:
+    """Image points (n, 2) of points (n, 3) in the system of the camera, before or behind it.
+
+    Besides, the derivatives by these (n, 2, 3), and by the parameters of the camera (n, 2, u).
+    """
+    parallel = getattr(camera, "parallel", False)
+    z = np.ones(len(points)) if parallel else points[:, 2]
+    direction = points[:, :2] / z[:, None]
+    xy, d_direction, d_camera = camera.derivatives(direction)
+    by_points = np.zeros((len(z), 2, 3))
+    by_points[:, :, :2] = d_direction / z[:, None, None]
+    if not parallel:
+        by_points[:, :, 2] = -(by_points[:, :, :2] @ direction[:, :, None])[:, :, 0]
+    return xy, by_points, d_camera
+
+
 def project(camera: PlaneMapping, pose: Pose, points: ArrayLike) -> Projection:
     """Image points of object points: the collinearity equations with the camera's distortion.
 
@@ -320,14 +336,9 @@ def project(camera: PlaneMapping, pose: Pose, points: ArrayLike) -> Projection:
     if object_points.ndim != 2 or object_points.shape[1] != 3:
         raise UsageError(f"object points have the shape {object_points.shape}, not (n, 3)")
     x_c, d_rotation = rotate(pose.rotation, object_points - pose.x0)
-    parallel = getattr(camera, "parallel", False)
-    z = np.ones(len(x_c)) if parallel else np.where(x_c[:, 2] > 0, x_c[:, 2], np.nan)
-    direction = x_c[:, :2] / z[:, None]
-    xy, d_direction, d_camera = camera.derivatives(direction)
-    d_x_c = np.zeros((len(z), 2, 3))
-    d_x_c[:, :, :2] = d_direction / z[:, None, None]
-    if not parallel:
-        d_x_c[:, :, 2] = -(d_x_c[:, :, :2] @ direction[:, :, None])[:, :, 0]
+    if not getattr(camera, "parallel", False):
+        x_c[x_c[:, 2] <= 0] = np.nan
+    xy, d_x_c, d_camera = seen_by(camera, x_c)
     d_point = d_x_c @ pose.matrix
     # The parameters of a camera that sees no points must not appear determined.
     d_camera[np.isnan(xy).any(axis=1)] = np.nan

@@ -218,6 +218,12 @@ class Camera:
         return model.name, None if self.additional is None else self.additional.model
 
     @property
+    def mapped_alike(self) -> bool:
+        """Whether the mapping alone gives what the compiled loops give."""
+        alone = self.shutter is None and self.additional is None
+        return alone and not self.parallel and not self.corrects_measured
+
+    @property
     def parallel(self) -> bool:
         """Whether the rays are parallel to the optical axis."""
         model = self.registered

@@ -23,6 +23,8 @@ Datum = Literal["control", "minimal", "free"]
 
 # An image has six unknowns: at least three points are needed.
 _LEAST_POINTS = 3
+# With fewer image points, mappings take about as long as loops, which have to be compiled.
+_FEW = 5000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -184,6 +186,15 @@ class Network(Display):
             _, at, number = np.unique(self.rig.exposure[on], return_index=True, return_inverse=True)
             first[on] = on[at[number.ravel()]]
         return first
+
+    @cached_property
+    def kernels(self) -> tuple[tuple[str, str | None] | None, ...]:
+        """Model and additional parameters of each camera for compiled loops; None where it is mapped.
+
+        It is where a model has no kernel, and where few image points are observed.
+        """
+        few = len(self.image_of) < _FEW
+        return tuple(None if few and each.mapped_alike else each.compiled_kind for each in self.cameras)
 
     @property
     def shutters(self) -> Mask:

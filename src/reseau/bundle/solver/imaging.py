@@ -21,7 +21,7 @@ from ...core.data import Array, Mask, Rows
 from ...optics.cameras.kernels import CameraColumns, camera
 from ...optics.cameras.registry import additional_model, camera_model
 from ...optics.mapping import PlaneMapping
-from ...optics.poses import Pose, matrix_to_vector, project
+from ...optics.poses import seen_by
 from ...optics.refraction import RefractedRays
 from ...optics.refraction.windows import Mounts
 from ..network.network import Network
@@ -395,7 +395,7 @@ class Imaging:
         self._air = np.full(len(network.images), -1, dtype=np.intp)
         if network.refraction is not None:
             self._path_of, self._path, self._mounted = network.refraction.split(network.camera_of)
-        kinds = [entry.compiled_kind for entry in network.cameras]
+        kinds = network.kernels
         known = list(dict.fromkeys(kind for kind in kinds if kind is not None))
         extras = [entry.additional for entry in (network.cameras[c] for c, _ in sets) if entry.additional]
         scanned = any(entry.shutter is not None or entry.parallel for entry in network.cameras)
@@ -514,6 +514,23 @@ class Imaging:
             )  # fmt: skip
 
 
+def in_cameras(at: Orientation, image: Rows, point: Rows) -> Array:
+    """Object points (n, 3) in the systems of their images."""
+    x = at.rotation[image] @ (at.xyz[point] - at.x0[image])[:, :, None]
+    return np.asarray(x[:, :, 0])
+
+
+def mapped_points(
+    camera: PlaneMapping, at: Orientation, image: Rows, point: Rows, bent: Bent, rows: Rows
+) -> Array:
+    """Compute image points (n, 2) only; see :func:`mapped`."""
+    x = in_cameras(at, image, point)
+    uv = x[:, :2] if camera.parallel else x[:, :2] / x[:, 2:]
+    through = np.flatnonzero(bent.path[image] >= 0)
+    uv[through] = bent.uv[rows[through]]
+    return np.asarray(camera(uv))
+
+
 def mapped(
     camera: PlaneMapping, at: Orientation, image: Rows, point: Rows, bent: Bent, rows: Rows
 ) -> tuple[Array, Array, Array, Array, Array]:
@@ -538,14 +555,11 @@ def mapped(
         Pixels, and derivatives by the pose (rotation about the axes of the camera, projection centre), by the
         parameters of the camera, by the point, and by the free parameters of windows and media.
     """
-    turn, x0, xyz = at.rotation[image], at.x0[image], at.xyz[point]
-    seen = project(camera, Pose(matrix_to_vector(turn), x0), xyz)
-    by_x = seen.d_point @ np.swapaxes(turn, 1, 2)
-    x = np.einsum("nij,nj->ni", turn, xyz - x0)
+    turn, x = at.rotation[image], in_cameras(at, image, point)
+    xy, by_x, by_camera = seen_by(camera, x)
+    by_point = by_x @ turn
     # g·(δ × x) = δ·(x × g)
-    by_turn = np.cross(x[:, None, :], by_x)
-    xy, by_camera, by_point = seen.xy.copy(), seen.d_camera.copy(), seen.d_point.copy()
-    by_pose = np.concatenate([by_turn, -seen.d_point], axis=2)
+    by_pose = np.concatenate([np.cross(x[:, None, :], by_x), -by_point], axis=2)
     by_windows = np.zeros((len(image), 2, max(bent.by.shape[2] - 9, 0)))
     if camera.parallel:
         by_pose[:, :, 3:] = -by_x

@@ -12,7 +12,7 @@ from ...core.data import Array, Mask, Rows, rows_of_groups
 from ...optics.mapping import PlaneMapping
 from ..network.network import Network
 from .constraints import Constraints
-from .imaging import Bent, Imaging, Seen, mapped
+from .imaging import Bent, Imaging, Seen, mapped, mapped_points
 from .normal import Pattern
 from .observations import OtherObservations
 from .threads import chunks_of, in_parallel
@@ -91,7 +91,7 @@ class System:
 
         in_parallel(work, self.chunks)
         for mapping, _, rows in self.mappings(values):
-            xy, *_more = mapped(mapping, at, self.seen.image[rows], self.seen.point[rows], bent, rows)
+            xy = mapped_points(mapping, at, self.seen.image[rows], self.seen.point[rows], bent, rows)
             out[rows] = self._weighted(rows, (xy - self.seen.xy[rows])[:, :, None])[:, :, 0]
         return out, (self.others.computed(values) - self.others.value) * self.sigma_root
 
@@ -225,14 +225,14 @@ def residuals(
     bend(0, len(rows))
     imaging.misfit(0, len(rows), seen, at, bent, values.cameras, values.extra, out)
     for mapping, _, own in _mappings(network, seen.camera, values):
-        xy, *_ = mapped(mapping, at, image[own], seen.point[own], bent, own)
+        xy = mapped_points(mapping, at, image[own], seen.point[own], bent, own)
         out[own] = xy - seen.xy[own]
     return out
 
 
 def _mappings(network: Network, camera_of: Rows, values: Values) -> list[tuple[PlaneMapping, int, Rows]]:
     """Return mapping, number and rows of the observations of each camera without a kernel."""
-    without = [c for c, camera in enumerate(network.cameras) if camera.compiled_kind is None]
+    without = [c for c, kernel in enumerate(network.kernels) if kernel is None]
     if not without:
         return []
     rays, at = rows_of_groups(camera_of, len(network.cameras)), values.cameras
