@@ -362,7 +362,7 @@ BROKEN = [
         "an image with two points",
         lambda: (lambda n: n.select((n.image_of != 6) | (np.cumsum(n.image_of == 6) < 3)))(block()),
         Code.TOO_FEW_POINTS,
-        ("image i6 has 2 points",),
+        ("image i6 has fewer than three points",),
     ),
     Broken(
         "a point in one image",
