@@ -204,17 +204,15 @@ def doubtful_parameters(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
     fit : BundleFit
         Its adjustment.
     """
-    network = problem.network
+    network, again, cameras = problem.network, fit, problem.network.cameras
     for usual in (True, False):
-        cameras = tuple(_freed(camera, usual=usual) for camera in network.cameras)
-        if all(new is old for new, old in zip(cameras, network.cameras, strict=True)):
-            continue
-        freed = replace(network, cameras=cameras)
-        again = replace(problem.continued(fit), network=freed, rounds=0).adjusted()
-        if not isinstance(again, Failure) and again.sigma0 * _FALLS < fit.sigma0:
-            break
-    else:
-        return []
+        freed = tuple(_freed(camera, usual=usual) for camera in network.cameras)
+        if any(new is not old for new, old in zip(freed, network.cameras, strict=True)):
+            trial = replace(
+                problem.continued(fit), network=replace(network, cameras=freed), rounds=0
+            ).adjusted()
+            if not isinstance(trial, Failure) and trial.sigma0 * _FALLS < again.sigma0:
+                again, cameras = trial, freed
     found = []
     for c, (new, old) in enumerate(zip(cameras, network.cameras, strict=True)):
         at, count = int(again.unknowns.camera[c]), len(new.free)
