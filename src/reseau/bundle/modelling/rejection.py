@@ -55,13 +55,11 @@ def without_gross_errors(
     """
     trimmed = _trimmed(problem, alpha)
     first = _careful(trimmed, alpha, max_fraction)
-    while not isinstance(first, Failure) and (first[2] or _given(trimmed) < _given(problem)):
+    if not isinstance(first, Failure) and (first[2] or _given(trimmed) < _given(problem)):
         # Better estimates restore what looked wrong with the approximate values.
-        trimmed = _trimmed(problem.continued(first[0]), alpha)
-        again = _careful(trimmed, alpha, max_fraction)
-        if isinstance(again, Failure) or not _used(again[0]) > _used(first[0]):
-            break
-        first = again
+        again = _careful(_trimmed(problem.continued(first[0]), alpha), alpha, max_fraction)
+        if not isinstance(again, Failure) and _used(again[0]) > _used(first[0]):
+            first = again
     if isinstance(first, Failure) or first[2]:
         plain = adjusted_in_steps(problem)
         if not isinstance(plain, Failure):
