@@ -9,7 +9,8 @@ projected by NumPy and SciPy alone, without approximate poses or points, and adj
 
 A network has converged to the right minimum where the parameters of the camera are within six standard
 deviations of the true ones, and the image points without gross errors fit as their standard deviations say.
-Named are gross errors above ten standard deviations on points with three or more good rays.
+Counted are points with three or more good rays, as a good ray that is left alone determines no point: named
+are gross errors above ten standard deviations, false those below four that are left out.
 """
 
 from __future__ import annotations
@@ -146,12 +147,11 @@ def outcome(seed: int) -> Case:
     rejected = result.rejected | ~result.fit.usable.images[network.image_of]
     usable = result.fit.usable.observations
     v = result.fit.residuals[: 2 * len(size)].reshape(-1, 2) / sigma
-    used = usable & ~gross & np.isfinite(v).all(axis=1)
-    enough = used.sum() > 0.9 * (~gross).sum()
+    fair = (np.bincount(network.point_of[~gross], minlength=len(network.points)) >= 3)[network.point_of]
+    used = usable & fair & ~gross & np.isfinite(v).all(axis=1)
+    enough = used.sum() > 0.9 * (fair & ~gross).sum()
     right = bool((off < 6).all() and enough and np.median((v[used] ** 2).sum(axis=1)) < 4)
-    fair = np.bincount(network.point_of[~gross], minlength=len(network.points)) >= 3
-    of = gross & fair[network.point_of]
-    good = size < 4
+    of, good = gross & fair, (size < 4) & fair
     return Case(
         images, kind, share, "right" if right else "wrong", int((rejected & of).sum()), int(of.sum()),
         int((rejected & good).sum()), int(good.sum()), said,

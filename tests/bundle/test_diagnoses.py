@@ -362,7 +362,7 @@ BROKEN = [
         "an image with two points",
         lambda: (lambda n: n.select((n.image_of != 6) | (np.cumsum(n.image_of == 6) < 3)))(block()),
         Code.TOO_FEW_POINTS,
-        ("image i6 has 2 points",),
+        ("image i6 has fewer than three points",),
     ),
     Broken(
         "a point in one image",
@@ -376,7 +376,7 @@ BROKEN = [
         "two blocks without a common point",
         lambda: two_blocks(free_block()),
         Code.TOO_FEW_POINTS,
-        ("left out",),
+        ("points in common with the others: another network; left out",),
     ),
     # Scale bars and control.
     *[
@@ -487,20 +487,26 @@ BROKEN = [
     Broken(
         "principal distance held at a wrong value",
         lambda: camera_of(with_camera(block(), free=()), c=8.6),
-        Code.UNMODELLED,
+        Code.INCONSISTENT,
         ("held parameters", "c 8.6"),
     ),
     Broken(
         "distortion held at zero",
         lambda: camera_of(with_camera(block(), free=("c",)), K1=0.0, K2=0.0),
-        Code.UNMODELLED,
+        Code.INCONSISTENT,
         ("held parameters", "K1 0"),
     ),
     Broken(
         "principal point held at a wrong place",
         lambda: camera_of(with_camera(block(), free=("c",)), x0=0.5),
-        Code.UNMODELLED,
+        Code.INCONSISTENT,
         ("held parameters", "x0 0.5"),
+    ),
+    Broken(
+        "pixels wider than said",
+        lambda: camera_of(with_camera(block(), free=("c", "x0", "y0", "K1", "K2")), B1=0.05),
+        Code.INCONSISTENT,
+        ("held parameters", "B1 0.05"),
     ),
     Broken(
         "sigmas a thousand times too small",

@@ -36,7 +36,7 @@ def bundle(
         Path,
         typer.Argument(
             help="Network: reseau-network/1, a file of PhotoModeler, Metashape, BAL, Bundler or libmv, "
-            "or a folder of COLMAP, OpenPTV or MicMac."
+            "or a folder of COLMAP, OpenPTV, MicMac or MMVII."
         ),
     ],
     out: v.Out | None = None,

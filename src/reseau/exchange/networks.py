@@ -20,6 +20,7 @@ from ..core.errors import FormatError, InputError, UsageError
 from ..core.files import head_of
 from ..io import FrameOrientation, read_text
 from ..io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Network1
+from .aicon import is_aicon, read_aicon
 from .bal import read_bal, write_bal
 from .bundler import is_bundler, read_bundler
 from .calibrations.formats import Exported
@@ -28,6 +29,7 @@ from .dbat import is_dbat, read_dbat
 from .libmv import is_libmv, read_libmv
 from .metashape import is_metashape, read_metashape
 from .micmac import is_micmac, read_micmac
+from .mmvii import is_mmvii, read_mmvii
 from .openptv import is_openptv, read_openptv
 from .photomodeler import read_photomodeler
 from .sfm import is_sfm, read_sfm
@@ -71,7 +73,9 @@ _THREE_COUNTS = re.compile(rb"\s*\d+[ \t]+\d+[ \t]+\d+[ \t]*[\r\n]")
 # In the order in which they are tried; the last two are numbers in lines only.
 _FORMATS = (
     _Format("MicMac", lambda at: is_micmac(at.path), read_micmac),
+    _Format("MMVII", lambda at: is_mmvii(at.path), read_mmvii),
     _Format("OpenPTV", lambda at: is_openptv(at.path), _plain(read_openptv)),
+    _Format("AICON", lambda at: is_aicon(at.path), _plain(read_aicon)),
     _Format("COLMAP", lambda at: at.has("cameras.txt", "cameras.bin"), _plain(read_colmap)),
     _Format("OpenMVG and AliceVision", lambda at: is_sfm(at.head), _plain(read_sfm)),
     _Format("Metashape", lambda at: is_metashape(at.head), _plain(read_metashape)),
@@ -232,7 +236,8 @@ def read_foreign(path: Path | str, control_sigma: float | None = None) -> Networ
     path : Path or str
         Text export of PhotoModeler, BAL or Bundler file, XML or ``.psz`` of Metashape, project of DBAT,
         problem of libmv, scene of OpenMVG or AliceVision, or folder with COLMAP's text or binary files, a
-        calibration of OpenPTV, or orientations of MicMac.
+        calibration of OpenPTV, or orientations of MicMac or MMVII, or a file of AICON (``.phc``, ``.obc``,
+        ``.ior``, ``.eor``), with the others beside it.
     control_sigma : float, optional
         See :func:`read_network`.
 
@@ -264,7 +269,7 @@ def read_foreign(path: Path | str, control_sigma: float | None = None) -> Networ
             "is not a folder of a known program",
             where=path,
             do="give a folder of COLMAP (cameras, images, points3D), of OpenPTV (with `parameters`), or "
-            "of MicMac (Ori-NAME)",
+            "of MicMac (Ori-NAME) or MMVII (Ori/NAME)",
         )
     raise FormatError(
         "is not a network of a known program",

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from ...adjust.reliability import critical_w
-from ...core.data import Rows
+from ...core.data import Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Remark
 from ..network.network import Network
@@ -33,6 +33,8 @@ _CORNER = 0.2
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 # Points are in a plane where their extent across it is this part of the largest.
 _PLANE = 1e-4
+# Points that determine a pose.
+_POSE = 3
 
 
 def listed(names: Iterable[object], most: int = LISTED) -> str:
@@ -64,8 +66,10 @@ def _gaps(result: Result) -> list[Remark]:
     Images whose points data snooping rejected are reported where that is decided.
     """
     network, fit = result.network, result.fit
-    found = []
     part, rays = fit.usable.points, network.rays
+    kept = np.bincount(network.image_of[~result.rejected], minlength=len(network.images))
+    images = np.flatnonzero(~fit.usable.images & ((kept > 0) | (network.seen == 0)))
+    found = _lost_images(network, images, part)
     lost = ~part & ~network.held.all(axis=1)
     nowhere = np.flatnonzero(lost & (rays == 0))
     if len(nowhere):
@@ -105,15 +109,6 @@ def _gaps(result: Result) -> list[Remark]:
                 Code.NOT_IDENTIFIED,
             )
         )
-    kept = np.bincount(network.image_of[~result.rejected], minlength=len(network.images))
-    images = np.flatnonzero(~fit.usable.images & ((kept > 0) | (network.seen == 0)))
-    for i in images[:LISTED]:
-        name, seen = network.images[i], int(network.seen[i])
-        why = "no points" if seen == 0 else f"{seen} point{'s' * (seen > 1)}"
-        enough = "three are needed" if seen < 3 else "its position could not be computed"
-        found.append(Remark(f"image {name} has {why}; {enough}; left out", Code.TOO_FEW_POINTS))
-    if len(images) > LISTED:
-        found.append(Remark(f"{len(images) - LISTED} more images are left out", Code.TOO_FEW_POINTS))
     used = np.bincount(network.camera_of[fit.usable.images], minlength=len(network.cameras))
     for c in np.flatnonzero(used == 0):
         found.append(
@@ -123,6 +118,37 @@ def _gaps(result: Result) -> list[Remark]:
             )
         )
     return found
+
+
+def _lost_images(network: Network, images: Rows, adjusted: Mask) -> list[Remark]:
+    """Images that were left out: too few points, no points in common with the others, or wrong names.
+
+    `adjusted` are the points (p,) that have coordinates.
+    """
+    common = np.bincount(network.image_of[adjusted[network.point_of]], minlength=len(network.images))
+    few = network.seen[images] < _POSE
+    apart = ~few & (common[images] < _POSE)
+    said = [
+        (few, "fewer than three points; left out"),
+        (
+            apart,
+            "fewer than three points in common with the others: another network; left out; adjust it "
+            "apart, or measure points that both show",
+        ),
+        (
+            ~few & ~apart,
+            "points that agree with no position; left out; are their names those of another image?",
+        ),
+    ]
+    return [
+        Remark(
+            f"{_plural('image', images[of])} {listed(network.images[i] for i in images[of])} "
+            f"{'has' if of.sum() == 1 else 'have'} {what}",
+            Code.TOO_FEW_POINTS,
+        )
+        for of, what in said
+        if of.any()
+    ]
 
 
 def checks(result: Result) -> list[Remark]:

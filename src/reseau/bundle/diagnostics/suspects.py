@@ -204,14 +204,15 @@ def doubtful_parameters(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
     fit : BundleFit
         Its adjustment.
     """
-    network = problem.network
-    cameras = tuple(_freed(camera) for camera in network.cameras)
-    if all(new is old for new, old in zip(cameras, network.cameras, strict=True)):
-        return []
-    freed = replace(network, cameras=cameras)
-    again = replace(problem.continued(fit), network=freed, rounds=0).adjusted()
-    if isinstance(again, Failure) or not again.sigma0 * _FALLS < fit.sigma0:
-        return []
+    network, again, cameras = problem.network, fit, problem.network.cameras
+    for usual in (True, False):
+        freed = tuple(_freed(camera, usual=usual) for camera in network.cameras)
+        if any(new is not old for new, old in zip(freed, network.cameras, strict=True)):
+            trial = replace(
+                problem.continued(fit), network=replace(network, cameras=freed), rounds=0
+            ).adjusted()
+            if not isinstance(trial, Failure) and trial.sigma0 * _FALLS < again.sigma0:
+                again, cameras = trial, freed
     found = []
     for c, (new, old) in enumerate(zip(cameras, network.cameras, strict=True)):
         at, count = int(again.unknowns.camera[c]), len(new.free)
@@ -234,17 +235,18 @@ def doubtful_parameters(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
         Remark(
             f"held parameters do not fit: sigma0 falls from {fit.sigma0:.3g} to {again.sigma0:.3g} "
             f"when they are estimated ({'; '.join(found)})",
-            Code.UNMODELLED,
+            Code.INCONSISTENT,
         )
     ]
 
 
-def _freed(camera: Camera) -> Camera:
-    """The camera with its usual parameters estimated; as it is, where they are already."""
+def _freed(camera: Camera, *, usual: bool) -> Camera:
+    """The camera with its usual or all parameters estimated; as it is, where they are already."""
     model = camera.registered
     if model is None or camera.covariance is not None:
         return camera
-    free = tuple(name for name in model.names if name in {*camera.free, *model.usual})
+    wanted = model.usual if usual else model.names
+    free = tuple(name for name in model.names if name in {*camera.free, *wanted})
     return camera if set(free) == set(camera.free) else replace(camera, free=free)
 
 

@@ -513,8 +513,9 @@ def _doubts(
     if not fit.sigma0 > _DOUBT:
         return doubts
     if len(problem.observations) <= MANY:
+        # Held values that are wrong make points and control look wrong.
         held = doubtful_parameters(current, fit)
-        doubts += held
+        doubts = [*held, *doubts]
         # Rays of control points are suspected with them.
         tie: Mask = np.asarray(np.isnan(problem.network.sigma).any(axis=1))[problem.network.point_of]
         rows = suspects(problem) if not of_control or tie.any() else np.zeros(0, dtype=np.intp)

@@ -53,7 +53,13 @@ def without_gross_errors(
     Images most of whose points are rejected are left out as a whole: the few that remain may fit by chance.
     Where the approximate values do not suffice, the adjustment of all observations gives better ones.
     """
-    first = _careful(_trimmed(problem, alpha), alpha, max_fraction)
+    trimmed = _trimmed(problem, alpha)
+    first = _careful(trimmed, alpha, max_fraction)
+    if not isinstance(first, Failure) and (first[2] or _given(trimmed) < _given(problem)):
+        # Better estimates restore what looked wrong with the approximate values.
+        again = _careful(_trimmed(problem.continued(first[0]), alpha), alpha, max_fraction)
+        if not isinstance(again, Failure) and _used(again[0]) > _used(first[0]):
+            first = again
     if isinstance(first, Failure) or first[2]:
         plain = adjusted_in_steps(problem)
         if not isinstance(plain, Failure):
@@ -71,7 +77,7 @@ def without_gross_errors(
     fit, steps, left = first
     steps = (*_of_gross_errors(problem, fit, steps, alpha), *steps)
     # Images that no pose explains are not even begun with.
-    left = [*left, *(int(i) for i in lost_images(problem.network, fit.values.x0, fit.values.xyz))]
+    left = sorted({*left, *lost_images(problem.network, fit.values.x0, fit.values.xyz).tolist()})
     if not left:
         return fit, steps, []
     names = listed(problem.network.images[i] for i in left)
@@ -102,6 +108,12 @@ def _of_gross_errors(
 def _used(fit: BundleFit) -> int:
     """Number of image points in an adjustment."""
     return int(fit.usable.observations.sum())
+
+
+def _given(problem: BundleProblem) -> int:
+    """Number of image points that may be used."""
+    n = len(problem.network.xy)
+    return n if problem.weights is None else int((problem.weights[: 2 * n : 2] > 0).sum())
 
 
 def _careful(
