@@ -29,12 +29,12 @@ def test_every_loop_of_the_list_is_a_compiled_function_of_as_many_arguments(loop
 @pytest.mark.slow
 def test_loops_are_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    one = next(loop for loop in main_loops() if loop.function.endswith("compiled_filter:filtered"))
+    one = next(loop for loop in main_loops() if loop.function.endswith("compiled:responses"))
     command = [
         sys.executable,
         "-c",
         "from reseau.core.ahead import *; from reseau.core.executors import Here\n"
-        f"print(compile_ahead(Here(), {{'filter': [main_loops()[{main_loops().index(one)}]]}}))",
+        f"print(compile_ahead(Here(), {{'responses': [main_loops()[{main_loops().index(one)}]]}}))",
     ]
     said = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)]
     assert "compiled=1, found=0" in said[0]
@@ -47,7 +47,7 @@ def test_what_is_missing_is_compiled_before_a_job_and_is_then_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    one = replace(next(loop for loop in main_loops() if loop.function.endswith(":filtered")), jobs=("one",))
+    one = replace(next(loop for loop in main_loops() if loop.function.endswith(":responses")), jobs=("one",))
     monkeypatch.setattr(ahead, "main_loops", lambda: (one,))
     assert ahead.missing_loops("other") == []
     assert ahead.missing_loops("one") == [one]
@@ -56,9 +56,9 @@ def test_what_is_missing_is_compiled_before_a_job_and_is_then_there(
 
 
 def test_a_list_that_is_older_than_the_code_is_named_with_what_to_do() -> None:
-    older = Loop("reseau.measure.compiled_filter:filtered", {}, ["float64"])
-    with pytest.raises(InputError, match=r"filter cannot be compiled as it says.*loops\.py"):
-        compile_ahead(Here(), {"filter": [older]})
+    older = Loop("reseau.optics.compiled:responses", {}, ["float64"])
+    with pytest.raises(InputError, match=r"responses cannot be compiled as it says.*loops\.py"):
+        compile_ahead(Here(), {"responses": [older]})
 
 
 def test_modules_have_all_loops() -> None:
@@ -76,7 +76,8 @@ def test_what_was_compiled_ahead_is_all_that_a_calibration_of_a_board_calls(tmp_
 
     def run(*words: str | Path) -> int:
         command = [sys.executable, "-c", RESEAU, *map(str, words)]
-        subprocess.run(command, env=environment, check=True, capture_output=True)
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        assert done.returncode in (0, 3), done.stderr  # 3: not usable for measurement
         return len(list((tmp_path / "compiled" / "reseau").glob("*.nbc")))
 
     run("design", "board", "--kind", "chess", "--columns", "10", "--rows", "7", "--pitch", "25",

@@ -140,15 +140,17 @@ def test_where_nothing_can_be_kept_it_is_compiled_all_the_same(tmp_path: Path) -
 
 def test_what_is_kept_tells_how_it_is_compiled_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    loop = named("reseau.measure.compiled_filter:filtered")
-    images, weights = np.ones((1, 9, 9), np.float32), np.ones((3, 3), np.float32)
-    loop(images, weights)
+    loop = named("reseau.optics.compiled:responses")
+    found = np.zeros((2, 3, 1, 1, 4), np.float32)
+    given = np.ones((1, 1), np.float32), np.zeros(1, np.float32), np.ones(1, np.float32)
+    loop(*given, found[0])
     (entry,) = listed(tmp_path / "reseau")
-    assert entry["function"] == "reseau.measure.compiled_filter:filtered"
+    assert entry["function"] == "reseau.optics.compiled:responses"
     again = named(entry["function"], entry["slots"])
     again.dispatcher.compile(types_of(entry["arguments"]))
     assert len(listed(tmp_path / "reseau")) == 1
-    np.testing.assert_array_equal(again(images, weights), loop(images, weights))
+    again(*given, found[1])
+    np.testing.assert_array_equal(found[1], found[0])
 
 
 def test_a_kernel_is_plain_python() -> None:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.data import Array, Mask, Rows
-from .compiled_filter import filtered
 from .matching import Shape
+from .matching.patches import filtered
 from .matching.shapes import Window
 
 _REACH = 5

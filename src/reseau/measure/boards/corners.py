@@ -18,10 +18,9 @@ from ...core.failure import Code
 from ...optics.composition import Chain
 from ...optics.corners import Corners, corner_images
 from ...optics.formation import PixelResponse, polygons
-from ..compiled_filter import filtered
 from ..marks.judging import Objection
 from ..matching import Matches, Shape
-from ..matching.patches import add_windows
+from ..matching.patches import add_windows, filtered
 from ..matching.shapes import GrownOutline, Window
 from ..plane.lattice_mapping import images_of, second_order
 from ..plane.lens_mapping import UNFIT, mapping_through

@@ -18,8 +18,8 @@ import scipy
 from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
-from ..compiled_filter import filtered
 from .matches import Matches
+from .patches import filtered
 
 _LAGS = 7
 """Largest distance of pixels along either axis: errors of a compressed picture end with its blocks of 8."""

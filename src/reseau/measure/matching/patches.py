@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -121,6 +122,14 @@ def add_windows(total: NDArray[Any], images: NDArray[Any], first: Rows) -> None:
         right, down, up, back = min(w - left, wide), min(h - top, high), max(0, -top), max(0, -left)
         if up < down and back < right:
             total[top + up : top + down, left + back : left + right] += image[up:down, back:right]
+
+
+def filtered(images: NDArray[Any], kernel: NDArray[Any]) -> Array:
+    """Images (m, r, c) weighted by a kernel (2 p + 1, 2 p + 1), without their borders of p pixels."""
+    (m, high, wide), reach = images.shape, len(kernel) // 2
+    # One image below the other: what one takes from the next lies in its border.
+    found = cv2.filter2D(images.reshape(m * high, wide), cv2.CV_32F, kernel).reshape(images.shape)
+    return np.ascontiguousarray(found[:, reach : high - reach, reach : wide - reach])
 
 
 class Patches:

@@ -308,14 +308,17 @@ def measure_reseau(
     at, found, judged = measurement.result()
     notes = placed.notes
     for _ in range(0 if use_nominal else _ORIENTATIONS):
-        placed, oriented = _oriented(source[known], placed, judged, grid)
+        placed, open_ = _oriented(source[known], placed, judged, grid)
         if placed is measurement.placed:
-            notes += oriented
+            placed, of_part = _another_part(source[known], placed, judged)
+            open_ += of_part
+        if placed is measurement.placed:
+            notes += open_
             break
         measurement = MarkMeasurement(frame, design, source[known], placed, options, lost)
         at, found, judged = measurement.result()
-    if not use_nominal or _beyond(frame, nominal):
-        notes += _open_names(source[known], judged, placed.screened.valid)
+    if use_nominal and _beyond(frame, nominal):
+        notes += _another_part(source[known], placed, judged)[1]
     why_not = _disagreement(source[known], judged, options) or _chance(measurement, at, judged)
     if why_not:
         return Failure(
@@ -433,12 +436,13 @@ def _oriented(
     return placed, (Remark(text, Code.AMBIGUOUS),)
 
 
-def _open_names(source: Array, judged: Verdict, valid: Mask) -> tuple[Remark, ...]:
-    """A note where the frame shows a part of a regular grid, and it may be another part."""
-    good = judged.why == ""
+def _another_part(source: Array, placed: Placement, judged: Verdict) -> tuple[Placement, tuple[Remark, ...]]:
+    """The part of a regular grid that fits the measured marks best, and a note if others fit as well."""
+    good, valid = judged.why == "", placed.screened.valid
     if good.sum() < _FEW or good.all():
-        return ()
-    chosen = misfit(source, judged.xy, good)
+        return placed, ()
+    best = chosen = misfit(source, judged.xy, good)
+    rival = None
     tree, pitch = scipy.spatial.KDTree(source), spacing(source)
     # Where a row in the frame is not seen, the picture ends there, and another one may be missing, too.
     missed = 2 * int((in_sight(judged.predicted, valid) & ~good).sum())
@@ -451,14 +455,21 @@ def _open_names(source: Array, judged: Verdict, valid: Mask) -> tuple[Remark, ..
         known: Mask = np.asarray(np.isfinite(renamed).all(axis=1))
         field = SmoothField.fit(source[known], renamed[known], local=False)
         missing = int((in_sight(field(source), valid) & ~known).sum())
-        if missing <= missed + _ALIKE * len(source) and misfit(source, renamed, known) < chosen / _UNEVEN:
-            text = (
-                f"the frame shows {int(good.sum())} of {len(source)} marks of a regular grid, and shifted by "
-                "a step they fit as well: names may be off by a row or column (give nominal "
-                "positions of this frame)"
-            )
-            return (Remark(text, Code.AMBIGUOUS),)
-    return ()
+        fit = misfit(source, renamed, known)
+        if missing <= missed + _ALIKE * len(source) and fit < (chosen / _UNEVEN if rival is None else best):
+            best, rival = fit, field
+    if rival is None:
+        return placed, ()
+    if best < _UNEVEN * chosen:
+        named = assign(source, rival(source), placed.candidates, valid, shifts=1)
+        if named is not None:
+            return replace(placed, assignment=named), ()
+    text = (
+        f"the frame shows {int(good.sum())} of {len(source)} marks of a regular grid, and shifted by "
+        "a step they fit as well: names may be off by a row or column (give nominal "
+        "positions of this frame)"
+    )
+    return placed, (Remark(text, Code.AMBIGUOUS),)
 
 
 def _chance(measurement: MarkMeasurement, at: Rows, judged: Verdict) -> str:
