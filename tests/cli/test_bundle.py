@@ -212,7 +212,7 @@ def test_networks_that_cannot_be_adjusted_are_refused_in_one_line(
 
 
 WARNED = {
-    "an image with two points": (two_points, "image i3 has 2 points"),
+    "an image with two points": (two_points, "image i3 has fewer than three points"),
     "a camera without image": (idle_camera, "camera spare has no image"),
 }
 
