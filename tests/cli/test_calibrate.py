@@ -316,7 +316,7 @@ def test_measurements_are_kept_in_a_store_and_not_repeated(
     BENCH.design.write(tmp_path / "field.json")
     files = photographs(tmp_path / "photos")
     command = (
-        "calibrate", *files, "-d", tmp_path / "field.json", "--pitch-mm", 0.027, "--free", "c", "--jobs",
+        "calibrate", *files, "-d", tmp_path / "field.json", "--pitch-mm", 0.027, "--free", "c,K1", "--jobs",
         1
     )  # fmt: skip
     kept = (*command, "--store", tmp_path / "store", "-o", tmp_path / "kept.json")
