@@ -74,7 +74,6 @@ def test_elimination_returns_the_failure_of_the_adjustment():
     assert "a with b" in found.reason
 
 
-@pytest.mark.slow
 def test_elimination_drops_at_its_level():
     """A term that is not there survives with probability alpha."""
     alpha, trials = 0.1, 400

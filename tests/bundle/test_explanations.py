@@ -75,7 +75,6 @@ def calibrated(
     return calibrate_camera(measured.items(), DESIGN, lambda _: None, SIZE, model, options).required()  # type: ignore[arg-type, return-value]
 
 
-@pytest.mark.slow
 def test_a_target_that_is_held_wrongly_does_not_choose_the_model_of_the_lens() -> None:
     found = calibrated(world(scale=1.003), model=None)
     assert {"k1", "k2"} <= set(found.result.network.cameras[0].free)

@@ -462,7 +462,6 @@ def test_separate_markers_are_measured_to_the_margin_of_a_wide_view() -> None:
     assert 0.8 < over_sigmas(found, error) < 1.2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("condition", "seed"),
     [("gamma", 0), ("motion6", 0), ("overexposed", 0), *slowly(("gamma", 2), ("motion6", 3))],

@@ -342,7 +342,6 @@ def test_a_session_is_the_origin_only_of_calibrations_among_its_results(archive:
     assert known.decision("left", first).session is None
 
 
-@pytest.mark.slow
 def test_a_creeping_drift_is_announced_and_held_back_and_counts_from_the_reference(archive: Archive) -> None:
     known, _ = started(archive)
     rng, made = np.random.default_rng(5), []
