@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from reseau.adjust.stochastic import Weighting
+from reseau.bundle.network import network as sizes
 from reseau.bundle.solver.imaging import _turned
 from reseau.bundle.solver.linear import Linear, linearised
 from reseau.bundle.solver.observations import OtherObservations
@@ -214,3 +215,19 @@ def test_a_moving_camera_turns_points_by_the_rotation_of_its_rate() -> None:
         _turned(0.8, np.array([[0.0, 0.0, 0.0, *rate]]), 0, x, y, z)
         np.testing.assert_allclose(y, rotation_matrix(0.8 * np.array(rate)) @ x, rtol=0, atol=1e-14)
         np.testing.assert_allclose(z, np.cross(rate, y), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("model", ["opencv", "brown-object"])
+def test_few_image_points_give_by_mappings_what_they_give_in_loops(
+    model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = []
+    for few in (0, 5000):
+        monkeypatch.setattr(sizes, "_FEW", few)
+        world = networks.world(images=4, points=8, cameras=(networks.camera(model),))
+        assert (world.network.kernels == (None,)) == (few > 0)
+        system, values = system_of(world)
+        linear = linearised(system, values)
+        results.append((dense(linear), linear.misfits, system.misfits(values)[0]))
+    for loops, mappings in zip(*results, strict=True):
+        np.testing.assert_allclose(mappings, loops, rtol=0, atol=1e-9 * max(1.0, np.abs(loops).max()))
