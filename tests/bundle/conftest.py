@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from reseau.bundle import Network
-from reseau.bundle.network import network as networks
 from reseau.io.network import Network1
 
 
@@ -26,5 +25,5 @@ def published(reference_data: Callable[[str], Path]) -> Callable[[str], Network]
 def in_loops() -> Iterator[None]:
     """Compute small networks in compiled loops, too, as large ones are."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(networks, "_FEW", 0)
+        monkeypatch.setattr("reseau.bundle.network.network._FEW", 0)
         yield

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from reseau.adjust.stochastic import Weighting
-from reseau.bundle.network import network as sizes
 from reseau.bundle.solver.imaging import _turned
 from reseau.bundle.solver.linear import Linear, linearised
 from reseau.bundle.solver.observations import OtherObservations
@@ -223,7 +222,7 @@ def test_few_image_points_give_by_mappings_what_they_give_in_loops(
 ) -> None:
     results = []
     for few in (0, 5000):
-        monkeypatch.setattr(sizes, "_FEW", few)
+        monkeypatch.setattr("reseau.bundle.network.network._FEW", few)
         world = networks.world(images=4, points=8, cameras=(networks.camera(model),))
         assert (world.network.kernels == (None,)) == (few > 0)
         system, values = system_of(world)

@@ -28,7 +28,7 @@ from ..bundle import Camera, Network
 from ..core.data import Array, Mask
 from ..core.errors import FormatError, InputError
 from ..io import read_text
-from ..optics.poses import angles_to_matrix, matrix_to_vector, rotation_matrix
+from ..optics.poses import angles_to_matrix, matrix_to_vector, rotation_matrix, seen_by
 from .lines import Control, network_of, numbers
 
 _SUFFIXES = (".phc", ".obc", ".ior", ".eor")
@@ -126,12 +126,9 @@ def _with_weights_of_residuals(network: Network, residuals: Array) -> Network:
     """
     turn = rotation_matrix(network.rotation)[network.image_of]
     x = np.einsum("nij,nj->ni", turn, network.xyz[network.point_of] - network.x0[network.image_of])
-    uv, plane = x[:, :2] / x[:, 2:], np.zeros((len(x), 2, 3))
-    plane[:, 0, 0] = plane[:, 1, 1] = 1 / x[:, 2]
-    plane[:, :, 2] = -uv / x[:, 2:]
-    by_point = plane @ turn
+    by_point = np.zeros((len(x), 2, 3))
     for camera, rows in zip(network.cameras, network.rays_of_cameras, strict=True):
-        by_point[rows] = camera.bare_mapping().derivatives(uv[rows]).d_xy @ by_point[rows]
+        by_point[rows] = seen_by(camera.bare_mapping(), x[rows])[1] @ turn[rows]
     new: Mask = np.asarray(~(network.observed | network.held).any(axis=1))
     left = []
     for weight in (1 / np.diagonal(network.cov, axis1=1, axis2=2), np.ones((len(x), 2))):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..bundle import Camera, Network
 from ..core.data import Array, Rows
-from ..core.errors import FormatError, InputError
+from ..core.errors import FormatError, InputError, UsageError
 from ..core.files import readable
 
 
@@ -97,6 +97,18 @@ class Control(NamedTuple):
     xyz: Array
     sigma: Array
     role: str
+
+
+def require_said(sigma: Array, path: Path, what: str) -> None:
+    """Ask for the standard deviations of control points where all are 1, which a program writes by default.
+
+    Raises
+    ------
+    UsageError
+        Says `what` all are 1, and which option gives them.
+    """
+    if (sigma == 1).any() and ((sigma == 1) | np.isnan(sigma)).all():
+        raise UsageError(what, where=path, do="say how good they are: --control-sigma, 0.01 for 1 cm")
 
 
 def network_of(

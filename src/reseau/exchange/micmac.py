@@ -26,11 +26,11 @@ import scipy
 
 from ..bundle import Camera, Network
 from ..core.data import Array, Mask, Rows
-from ..core.errors import FormatError, UsageError
+from ..core.errors import FormatError
 from ..core.files import head_of
 from ..io import read_text
 from ..optics.poses import matrix_to_vector
-from .lines import Control, network_of, numbers, read_bytes
+from .lines import Control, network_of, numbers, read_bytes, require_said
 from .markup import Node, read_markup
 
 _PATTERN = "Orientation-*.xml"
@@ -130,11 +130,11 @@ def read_micmac(path: Path | str, control_sigma: float | None = None) -> Network
             do="put homologous points to Homol, or add the measured control points",
         )  # fmt: skip
     sigma = np.array([spread for _, spread in given.values()]).reshape(-1, 3)
-    if control_sigma is None and (sigma == 1).any() and ((sigma == 1) | np.isnan(sigma)).all():
-        raise UsageError(
-            "gives all control points the uncertainty 1, which is GCPConvert's default for Campari's factor",
-            where=path, do="say how good they are: --control-sigma, 0.01 for 1 cm",
-        )  # fmt: skip
+    if control_sigma is None:
+        what = (
+            "gives all control points the uncertainty 1, which is GCPConvert's default for Campari's factor"
+        )
+        require_said(sigma, path, what)
     return network_of(
         tuple(cameras), tuple(images), np.array(camera_of, dtype=np.intp),
         matrix_to_vector(np.array(turns)), np.array(centres), names, np.full((len(names), 3), np.nan), seen,

@@ -22,9 +22,9 @@ import numpy as np
 
 from ..bundle import Camera, Network
 from ..core.data import Array
-from ..core.errors import FormatError, UsageError
+from ..core.errors import FormatError
 from ..optics.poses import matrix_to_vector
-from .lines import Control, network_of
+from .lines import Control, network_of, require_said
 from .markup import Node, read_markup
 
 _PATTERN = "Ori-PerspCentral-*.xml"
@@ -103,11 +103,10 @@ def read_mmvii(path: Path | str, control_sigma: float | None = None) -> Network:
     given = {_name(one.need("Name")): one for file in _set_of(path, _GIVEN) for one in _points(file)}
     known = {name: _known(one, control_sigma) for name, one in given.items() if name in places}
     sigma = np.array([point.sigma for point in known.values()]).reshape(-1, 3)
-    if control_sigma is None and (sigma == 1).any() and ((sigma == 1) | np.isnan(sigma)).all():
-        raise UsageError(
-            "gives all points the variance 1, which is what ImportGCP writes by default",
-            where=path, do="say how good they are: --control-sigma, 0.01 for 1 cm",
-        )  # fmt: skip
+    if control_sigma is None:
+        require_said(
+            sigma, path, "gives all points the variance 1, which is what ImportGCP writes by default"
+        )
     xyz = np.array([known[name].xyz if name in known else np.full(3, np.nan) for name in places])
     return network_of(
         tuple(of_file.values()), tuple(images), np.array(camera_of, dtype=np.intp),

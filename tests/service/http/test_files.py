@@ -230,8 +230,8 @@ def test_a_photograph_with_too_many_pixels_or_bytes_in_memory_is_refused(tmp_pat
     with Decoder(DecodingLimits(pixels=1_000_000)) as few, pytest.raises(ImageError, match="pixels"):
         few.frame(path, "a")
     with (
-        Decoder(DecodingLimits(memory=200 << 20, seconds=2)) as small,
-        pytest.raises(ImageError, match=r"memory|damaged|takes longer"),
+        Decoder(DecodingLimits(memory=200 << 20, seconds=60)) as small,
+        pytest.raises(ImageError, match=r"memory|damaged"),
     ):
         small.frame(path, "a")
 

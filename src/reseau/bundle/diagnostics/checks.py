@@ -11,7 +11,7 @@ from ...adjust.reliability import critical_w
 from ...core.data import Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Remark
-from ..network.network import Network
+from ..network.network import LEAST_POINTS, Network
 from ..solver.problem import BundleFit
 from .patterns import CommonPattern, by_place, common_pattern
 from .regularisation import regularised
@@ -33,8 +33,6 @@ _CORNER = 0.2
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 # Points are in a plane where their extent across it is this part of the largest.
 _PLANE = 1e-4
-# Points that determine a pose.
-_POSE = 3
 
 
 def listed(names: Iterable[object], most: int = LISTED) -> str:
@@ -126,8 +124,8 @@ def _lost_images(network: Network, images: Rows, adjusted: Mask) -> list[Remark]
     `adjusted` are the points (p,) that have coordinates.
     """
     common = np.bincount(network.image_of[adjusted[network.point_of]], minlength=len(network.images))
-    few = network.seen[images] < _POSE
-    apart = ~few & (common[images] < _POSE)
+    few = network.seen[images] < LEAST_POINTS
+    apart = ~few & (common[images] < LEAST_POINTS)
     said = [
         (few, "fewer than three points; left out"),
         (

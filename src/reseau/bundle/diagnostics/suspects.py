@@ -205,9 +205,11 @@ def doubtful_parameters(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
         Its adjustment.
     """
     network, again, cameras = problem.network, fit, problem.network.cameras
+    tried = [camera.free for camera in cameras]
     for usual in (True, False):
         freed = tuple(_freed(camera, usual=usual) for camera in network.cameras)
-        if any(new is not old for new, old in zip(freed, network.cameras, strict=True)):
+        if (free := [camera.free for camera in freed]) != tried:
+            tried = free
             trial = replace(
                 problem.continued(fit), network=replace(network, cameras=freed), rounds=0
             ).adjusted()

@@ -22,7 +22,7 @@ from .turntable import stage_of_turntable
 Datum = Literal["control", "minimal", "free"]
 
 # An image has six unknowns: at least three points are needed.
-_LEAST_POINTS = 3
+LEAST_POINTS = 3
 # With fewer image points, mappings take about as long as loops, which have to be compiled.
 _FEW = 5000
 
@@ -477,7 +477,7 @@ def usable(network: Network, counted: Mask, x0: Array, xyz: Array) -> Usable:
         rows = rows & images[network.image_of] & points[network.point_of]
         rays = np.bincount(network.point_of[rows], minlength=len(points))
         seen = np.bincount(network.image_of[rows], minlength=len(images))
-        fewer_points, fewer_images = points & (rays >= needed), images & (seen >= _LEAST_POINTS)
+        fewer_points, fewer_images = points & (rays >= needed), images & (seen >= LEAST_POINTS)
         if (fewer_points == points).all() and (fewer_images == images).all():
             return Usable(rows, images, points)
         points, images = fewer_points, fewer_images

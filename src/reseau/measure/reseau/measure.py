@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -308,17 +309,16 @@ def measure_reseau(
     at, found, judged = measurement.result()
     notes = placed.notes
     for _ in range(0 if use_nominal else _ORIENTATIONS):
-        placed, open_ = _oriented(source[known], placed, judged, grid)
+        placed, oriented = _oriented(source[known], placed, judged, grid)
         if placed is measurement.placed:
-            placed, of_part = _another_part(source[known], placed, judged)
-            open_ += of_part
+            placed = _as_best_part(source[known], placed, judged)
         if placed is measurement.placed:
-            notes += open_
+            notes += oriented
             break
         measurement = MarkMeasurement(frame, design, source[known], placed, options, lost)
         at, found, judged = measurement.result()
-    if use_nominal and _beyond(frame, nominal):
-        notes += _another_part(source[known], placed, judged)[1]
+    if not use_nominal or _beyond(frame, nominal):
+        notes += _open_names(source[known], judged, placed.screened.valid)
     why_not = _disagreement(source[known], judged, options) or _chance(measurement, at, judged)
     if why_not:
         return Failure(
@@ -436,13 +436,42 @@ def _oriented(
     return placed, (Remark(text, Code.AMBIGUOUS),)
 
 
-def _another_part(source: Array, placed: Placement, judged: Verdict) -> tuple[Placement, tuple[Remark, ...]]:
-    """The part of a regular grid that fits the measured marks best, and a note if others fit as well."""
-    good, valid = judged.why == "", placed.screened.valid
+def _as_best_part(source: Array, placed: Placement, judged: Verdict) -> Placement:
+    """The placement by another part of a regular grid, where that fits the measured marks better."""
+    rival = _another_part(source, judged, placed.screened.valid)
+    if rival is None or rival.fit >= _UNEVEN * rival.chosen:
+        return placed
+    named = assign(source, rival.field(source), placed.candidates, placed.screened.valid, shifts=1)
+    return placed if named is None else replace(placed, assignment=named)
+
+
+def _open_names(source: Array, judged: Verdict, valid: Mask) -> tuple[Remark, ...]:
+    """A note where the frame shows a part of a regular grid, and it may be another part."""
+    if _another_part(source, judged, valid) is None:
+        return ()
+    text = (
+        f"the frame shows {int((judged.why == '').sum())} of {len(source)} marks of a regular grid, and "
+        "shifted by a step they fit as well: names may be off by a row or column (give nominal "
+        "positions of this frame)"
+    )
+    return (Remark(text, Code.AMBIGUOUS),)
+
+
+class _Part(NamedTuple):
+    """Another part of a grid: where its marks are, its misfit, and that of the chosen part."""
+
+    field: SmoothField
+    fit: float
+    chosen: float
+
+
+def _another_part(source: Array, judged: Verdict, valid: Mask) -> _Part | None:
+    """The part of a regular grid, shifted by a step, that fits the measured marks best and about as well."""
+    good = judged.why == ""
     if good.sum() < _FEW or good.all():
-        return placed, ()
-    best = chosen = misfit(source, judged.xy, good)
-    rival = None
+        return None
+    chosen = misfit(source, judged.xy, good)
+    best: _Part | None = None
     tree, pitch = scipy.spatial.KDTree(source), spacing(source)
     # Where a row in the frame is not seen, the picture ends there, and another one may be missing, too.
     missed = 2 * int((in_sight(judged.predicted, valid) & ~good).sum())
@@ -456,20 +485,11 @@ def _another_part(source: Array, placed: Placement, judged: Verdict) -> tuple[Pl
         field = SmoothField.fit(source[known], renamed[known], local=False)
         missing = int((in_sight(field(source), valid) & ~known).sum())
         fit = misfit(source, renamed, known)
-        if missing <= missed + _ALIKE * len(source) and fit < (chosen / _UNEVEN if rival is None else best):
-            best, rival = fit, field
-    if rival is None:
-        return placed, ()
-    if best < _UNEVEN * chosen:
-        named = assign(source, rival(source), placed.candidates, valid, shifts=1)
-        if named is not None:
-            return replace(placed, assignment=named), ()
-    text = (
-        f"the frame shows {int(good.sum())} of {len(source)} marks of a regular grid, and shifted by "
-        "a step they fit as well: names may be off by a row or column (give nominal "
-        "positions of this frame)"
-    )
-    return placed, (Remark(text, Code.AMBIGUOUS),)
+        if missing <= missed + _ALIKE * len(source) and fit < (
+            chosen / _UNEVEN if best is None else best.fit
+        ):
+            best = _Part(field, fit, chosen)
+    return best
 
 
 def _chance(measurement: MarkMeasurement, at: Rows, judged: Verdict) -> str:
