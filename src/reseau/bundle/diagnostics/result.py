@@ -280,7 +280,8 @@ class Result(Estimated, Display):
 
     def rivals_of(self, c: int) -> tuple[Rival, ...]:
         """Models of other kinds that a camera may have."""
-        return self.rivals[c] if self.rivals else ()
+        own = self._considered.get(c)
+        return own.rivals if own is not None else self.rivals[c] if self.rivals else ()
 
     def with_considered(
         self, c: int, names: tuple[str, ...], columns: Rows, covariance: Array
