@@ -105,7 +105,8 @@ class Result(Estimated, Display):
         with all parameters and with the kept ones.
     rivals : tuple of tuple of Rival, optional
         Models of other kinds that each camera may have, where the model was chosen by these observations: the
-        covariances of cameras contain these, and what coefficients could do that were held at zero.
+        covariances of cameras contain these, and what coefficients could do that were held at zero. None of
+        a camera whose model was given.
 
     Examples
     --------
@@ -127,7 +128,7 @@ class Result(Estimated, Display):
     components: VarianceComponents[BundleFit] | None = None
     eliminated: tuple[Eliminated, ...] | None = None
     validation: tuple[float, float] | None = None
-    rivals: tuple[tuple[Rival, ...], ...] | None = None
+    rivals: tuple[tuple[Rival, ...] | None, ...] | None = None
 
     @property
     def sigma0(self) -> float:
@@ -281,7 +282,7 @@ class Result(Estimated, Display):
     def rivals_of(self, c: int) -> tuple[Rival, ...]:
         """Models of other kinds that a camera may have."""
         own = self._considered.get(c)
-        return own.rivals if own is not None else self.rivals[c] if self.rivals else ()
+        return own.rivals if own is not None else (self.rivals[c] or ()) if self.rivals else ()
 
     def with_considered(
         self, c: int, names: tuple[str, ...], columns: Rows, covariance: Array
@@ -300,6 +301,8 @@ class Result(Estimated, Display):
         """Coefficients of each camera that were held at zero, where some were."""
         found = dict[int, Considered]()
         for c, rivals in enumerate(self.rivals or ()):
+            if rivals is None:
+                continue
             columns = self.camera_columns(c)[1]
             own = considered(self.fit, c, columns, self._shared_uncertainty(columns).covariance, rivals)
             if own is not None:
