@@ -11,6 +11,7 @@ import pytest
 
 from reseau.api import calibrate
 from reseau.calibration import Calibration
+from reseau.core.errors import UsageError
 from reseau.designs import regular_reseau
 from reseau.io import Mark
 from reseau.optics import OpenCV, PixelGrid, Pose, camera_model, project
@@ -94,6 +95,18 @@ def test_each_camera_and_its_place_are_within_their_sigmas(
     assert "right/00.csv" in report
 
 
+@pytest.mark.slow
+def test_a_folder_has_the_rig_for_other_programs_and_maps_of_rectified_images(
+    reseau: Run, measured: Path, tmp_path: Path
+) -> None:
+    command = ("calibrate", *both(measured), "-d", measured / "disks.json", *FREE)
+    status, out, err = reseau(*command, "-o", tmp_path / "rig")
+    assert (status, err) == (0, "")
+    names = {path.name for path in (tmp_path / "rig").iterdir()}
+    assert {"camchain.yaml", "rig_config.json", "rectified.npz"} < names
+    assert "rectified images, maps for cv2.remap: rows off by " in out
+
+
 @pytest.fixture
 def exchanged(measured: Path, tmp_path: Path) -> Path:
     """The same, with two files of the right camera exchanged."""
@@ -139,5 +152,8 @@ def test_each_camera_may_have_a_model_and_a_size_of_its_own(reseau: Run, of_all:
     sizes = {"left": (640, 480), "right": (1024, 768)}
     again = calibrate(both, tmp_path / "disks.json", model=lenses, image_size=sizes).required()
     assert again.cameras["right"]["k1"] == other.parameters["k1"].value
+    assert again.rectified("right").greatest_px < 0.5
+    with pytest.raises(UsageError, match="is none of left, right"):
+        again.rectified("front")
     wrong = own.replace("model=", "pitch-mm=1,focus=")
     assert reseau("calibrate", *rig, wrong, *files)[0] == 2
