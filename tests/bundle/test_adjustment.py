@@ -36,6 +36,7 @@ def disturbed(network: Network, part: float, seed: int) -> tuple[Network, set[in
     return replace(network, xy=xy), set(bad.tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("control", [0, pytest.param(6, marks=pytest.mark.slow)])
 def test_of_forty_percent_gross_errors_nearly_all_are_found_from_no_approximate_values(control: int) -> None:
     datum = "control" if control else "free"

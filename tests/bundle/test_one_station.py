@@ -26,6 +26,7 @@ def turning(base: float, seed: int) -> Network:
     return replace(network, cameras=(start,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base", [pytest.param(0.0, marks=pytest.mark.slow), 1e-4])
 def test_a_camera_that_only_turned_has_no_points_and_says_what_rotations_give(base: float) -> None:
     found = adjust_network(turning(base, 1))

@@ -123,6 +123,7 @@ def test_the_gradient_by_places_and_window_is_that_of_the_cost(window: Window) -
     assert float((slope * linear.misfits).sum()) == pytest.approx(float(own.gradient @ q), abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [12, pytest.param(100, marks=pytest.mark.slow)])
 def test_errors_of_the_window_and_places_have_their_covariances(seeds: int) -> None:
     window, places, sigma0 = [], [], []

@@ -289,6 +289,7 @@ def test_standard_deviations_are_right_to_five_percent(kind: str) -> None:
     assert 0.95 < np.sqrt(normalised(kind, range(100, 300)).mean()) < 1.05
 
 
+@pytest.mark.slow
 def test_a_global_shutter_would_be_wrong_and_is_noticed() -> None:
     scene = scene_of_kind("rolling")
     world = world_of(scene)
@@ -417,6 +418,7 @@ def test_commands_take_shutters(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert float(frozen.split("sigma0 ")[1].split(",")[0]) > 3
 
 
+@pytest.mark.slow
 def test_a_narrow_lens_does_not_tell_shifts_from_rotations_and_says_so() -> None:
     """Within half a degree of the axis; vx, vy, wz are found where the camera is known."""
     far, size = 200.0, 0.5

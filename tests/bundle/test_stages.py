@@ -232,6 +232,7 @@ def test_the_sense_about_an_approximate_axis_is_reported() -> None:
     assert any("in the opposite sense" in str(warning) for warning in result.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cameras", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_wrong_angle_is_named_and_estimated_where_outliers_are_rejected(cameras: int) -> None:
     network = turned(cameras=cameras, cold=True).network

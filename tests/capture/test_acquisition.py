@@ -213,6 +213,7 @@ def test_a_frame_exposed_while_the_table_moves_is_rejected(rig: FieldRig, sessio
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", [pytest.param("moving", marks=pytest.mark.slow), "exposing"])
 def test_after_a_pause_nothing_is_exposed_or_stored_twice(rig: FieldRig, session: Session, when: str) -> None:
     """The engine replays all messages since the checkpoint, the exposure among them."""

@@ -142,6 +142,7 @@ def test_the_same_network_gives_the_same_bytes(reseau: Run, network: Callable[..
     assert reseau("bundle", path, "--json") == reseau("bundle", path, "--json")
 
 
+@pytest.mark.slow
 def test_gross_errors_are_named_and_rejected(reseau: Run, network: Callable[..., Path]) -> None:
     def blunder(document: dict[str, Any]) -> None:
         document["observations"]["x"][17] += 40.0
@@ -232,6 +233,7 @@ def test_the_document_is_read_back_as_it_was_written() -> None:
     assert next(iter(document.to_dict())) == "schema"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", [(4, 10), *slowly(((0, 4),), ((0, 14),))])
 def test_swapped_control_points_are_reported(
     pair: tuple[int, int], reseau: Run, network: Callable[..., Path]

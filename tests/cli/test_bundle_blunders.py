@@ -142,6 +142,7 @@ def test_mirrored_control_is_reported(axis: int, reseau: Run, tmp_path: Path) ->
     assert "mirrored" in said(*reseau("bundle", written(tmp_path, document), "--json"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", [(0, 1), *slowly(((2, 5),))])
 def test_a_swapped_pair_of_control_points_is_named(
     pair: tuple[int, int], reseau: Run, tmp_path: Path
@@ -153,6 +154,7 @@ def test_a_swapped_pair_of_control_points_is_named(
     assert f"control points p{pair[0]} and p{pair[1]} look exchanged" in words
 
 
+@pytest.mark.slow
 def test_a_mirrored_control_point_is_named(reseau: Run, tmp_path: Path) -> None:
     document = block()
     document["points"]["xyz"][3][0] *= -1

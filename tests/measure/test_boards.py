@@ -226,6 +226,7 @@ def test_large_circles_through_a_wide_lens_or_in_part_have_the_sigmas_of_their_e
     assert np.sqrt((error**2).mean()) < 0.004
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("design", "printed"),
     [
@@ -405,6 +406,7 @@ def test_circles_cut_by_the_border_are_right_where_a_filter_does_not_know_what_i
     assert 0.8 < np.sqrt((scaled**2).mean()) < 1.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("design", "printed"),
     [
@@ -503,6 +505,7 @@ def test_the_curve_of_a_camera_is_learnt_from_few_circles(seed: int) -> None:
 DELTILLE, DELTILLE_PRINT = board("deltille", 9, 8, 25.0), prints.Deltille(9, 8, 25.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "nearer", "blur"), [(0, 1.0, 0.7), *slowly((2, 0.8, 2.2))])
 def test_corners_of_a_deltille_are_measured_to_their_sigmas_and_named(
     seed: int, nearer: float, blur: float
@@ -534,6 +537,7 @@ def test_a_deltille_seen_at_60_degrees_is_numbered(k: int, least: int) -> None:
     assert 0.7 < over_sigmas(found, error) < 1.3
 
 
+@pytest.mark.slow
 def test_a_deltille_seen_in_part_is_not_taken_for_places_beside_its_corners() -> None:
     """In a frame that was shortened, weaker places on edges are in a lattice, too, with more nodes."""
     view = views("cropped", 1, DELTILLE_PRINT)[0]

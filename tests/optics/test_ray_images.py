@@ -153,6 +153,7 @@ def counted_image(
     return image
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("colours", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_the_formed_image_is_that_of_counted_rays(colours: int) -> None:
     view, small = camera(0.05), target(30.0, -20.0, 600.0, 10.0)

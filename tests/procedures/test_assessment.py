@@ -89,6 +89,7 @@ def test_a_covered_and_accurate_calibration_is_usable_for_measurement(sound: Cal
     assert "enough for measurement" in found.lines[1] or "no further" in found.lines[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k3", [pytest.param(0.0, marks=pytest.mark.slow), 0.02])
 def test_the_error_that_is_stated_holds_for_a_lens_with_more_terms(k3: float, sound: Calibrated) -> None:
     """What k1 and k2 make of k3 is right where points are, and wrong by ten sigmas in the corners."""

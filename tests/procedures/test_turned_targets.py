@@ -78,6 +78,7 @@ def test_photographs_that_name_points_differently_give_the_accuracy_of_those_tha
             assert abs(value - TRUE[name]) < 4 * sigma < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("design", [*slowly(board("chess", 7, 10, 20.0)), board("circles", 7, 10, 20.0)])
 def test_photographs_of_a_part_that_name_its_points_shifted_are_named_alike(design: BoardDesign) -> None:
     two_rows = 2 * (6 if design.kind == "chess" else 7)

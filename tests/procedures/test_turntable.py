@@ -46,6 +46,7 @@ def recordings(seed: int) -> list[tuple[str, ImagePoints]]:
     return seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *slowly(1, 2)])
 def test_points_without_depth_do_not_prevent_convergence(seed: int) -> None:
     model = CameraOptions("brown", ("c", "x0", "y0", "K1"), (0.027, 0.027))

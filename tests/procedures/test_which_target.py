@@ -79,6 +79,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
+@pytest.mark.slow
 def test_where_a_lattice_is_seen_no_testfield_is_looked_for(tried: list[str]) -> None:
     frame, _ = picture(board("chess", 9, 8, 24.0))
     designs: dict[str, Design] = {"field": coded_testfield(4, 4, 30.0)}
@@ -102,6 +103,7 @@ def test_lines_are_not_looked_for_where_markers_are_read(tried: list[str]) -> No
     assert tried == ["mine", "mine"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [pytest.param((100, 7), marks=pytest.mark.slow), (333, 492)])
 def test_a_puzzleboard_is_found_by_the_parts_that_photographs_show(start: tuple[int, int]) -> None:
     signs = dot_signs(board("puzzle", 12, 9, 22.0, start=start))

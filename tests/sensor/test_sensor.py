@@ -52,6 +52,7 @@ def test_the_truth_is_recovered_within_its_sigmas() -> None:
         assert abs(np.mean(normalised)) < 0.52, name
 
 
+@pytest.mark.slow
 def test_defective_pixels_are_found_with_few_false_alarms() -> None:
     found, wrong = 0, 0
     for seed in range(40):
