@@ -19,14 +19,20 @@ from ...optics import RationalPolynomial
 from ..film.roll import Kind
 from ..fitting import fit_mapping
 from ..points import Reason
-from .forms import boldest_of, margin_of, reach_of
+from .forms import reach_of
 from .result import FiducialResult
-from .search import Attitude, Pattern, attitudes, find_patterns, formed_mark, least_scales
-from .windows import match_marks, tracked
+from .search import (
+    Attitude,
+    Candidates,
+    Pattern,
+    attitudes,
+    find_patterns,
+    formed_mark,
+    least_scales,
+    overview_size,
+)
+from .windows import match_marks, moves_of, tracked
 
-_MARK_PX, _BOLD_PX, _LONGEST = 24.0, 1.0, 3000
-"""Size of the smallest mark with its surroundings, and width of its boldest part, in the overview; largest
-longer side of that."""
 _STATED, _UNKNOWN = 0.03, 0.08
 """Relative uncertainty of the scale that a file states, and of one step of those that are tried."""
 _NO_TAG = (72.0, 96.0)
@@ -43,8 +49,6 @@ _SURE = 0.85
 """Median of these correlations from which no other pattern is examined."""
 _ALIKE_ALL = 0.7
 """Least median of these correlations."""
-_MOST_SIGMA_PX, _MOST_SIGMA_MM = 1.0, 0.03
-"""Largest standard deviation of a coordinate; the larger of the two applies."""
 _FILM_MM = 0.005
 """Irregular deformation of film and scanner between marks, one sigma: the least weight of their distances."""
 _UNLIKE_MM = 0.02
@@ -67,6 +71,8 @@ class FiducialOptions:
         Rotation of the camera's x-axis in the scan, degrees counter-clockwise.
     mirrored : bool, optional
         Whether the scan shows the film from behind.
+    negative : bool, optional
+        Whether the scan shows bright marks of the design dark, and dark ones bright; by default found.
     transform : {"similarity", "affine", "projective", "bilinear"}
         Kind of the transformation to the calibrated coordinates.
     max_tilt_deg : float
@@ -81,6 +87,7 @@ class FiducialOptions:
     dpi: v.Dpi | None = None
     rotation: int | None = None
     mirrored: v.Mirrored | None = None
+    negative: v.Negative | None = None
     transform: v.Transform = "affine"
     max_tilt_deg: float = 8.0
 
@@ -216,23 +223,11 @@ def _at_scale(
     scan: Scan, design: FiducialDesign, options: FiducialOptions, scale: float, within: float
 ) -> list[tuple[Pattern, float]]:
     """Patterns at one scale: those of the best attitude, and of others as good."""
-    # Thin lines of large marks would vanish in an overview in which the marks are just large enough.
-    smallest = min(
-        min(2 * (reach_of(mark) + margin_of(mark)) / _MARK_PX, boldest_of(mark) / _BOLD_PX)
-        for mark in design.marks.values()
-    )
-    r = max(1.0, smallest * scale, max(scan.width, scan.height) / _LONGEST)
-    overview, reduction = scan.overview(int(np.ceil(max(scan.width, scan.height) / r)))
-    grey = np.ascontiguousarray(overview.mean(axis=2))
-    patterns = find_patterns(
-        grey,
-        design,
-        scale / reduction,
-        within,
-        attitudes(options.rotation, options.mirrored),
-        options.max_tilt_deg,
-        scan.full_scale / 255 * 0.6,
-    )
+    candidates = Candidates.of_scan(scan, overview_size(scan, design, scale))
+    reduction = candidates.reduction
+    negative = (False, True) if options.negative is None else (options.negative,)
+    ways = [(attitude, n) for n in negative for attitude in attitudes(options.rotation, options.mirrored)]
+    patterns = find_patterns(candidates, design, scale / reduction, within, ways, options.max_tilt_deg)
     if not patterns:
         return []
     # Attitudes that use the same candidates are compared after the measurement.
@@ -246,7 +241,7 @@ def _at_scale(
 def _same_places(one: Pattern, other: Pattern) -> bool:
     a, b = (p.xy[np.isfinite(p.xy).all(axis=1)] for p in (one, other))
     near = np.hypot(*(a[:, None] - b[None]).transpose(2, 0, 1)).min(axis=1) < 3.0
-    return bool(near.all())
+    return bool(near.all()) and one.negative == other.negative
 
 
 def _measured(
@@ -265,9 +260,10 @@ def _measured(
     expected = design.xy @ linear.T + shift
     seen: Mask = np.asarray(np.isfinite(start).all(axis=1))
     columns = _Columns.empty(n)
-    _look(scan, design, linear, np.where(seen[:, None], start, expected), 2.0 * reduction, columns, range(n))
+    shown = design.reversed() if pattern.negative else design
+    _look(scan, shown, linear, np.where(seen[:, None], start, expected), 2.0 * reduction, columns, range(n))
     scale = float(np.sqrt(abs(np.linalg.det(linear))))
-    film = _Film(pattern.attitude, (scan.width, scan.height), scale)
+    film = _Film(pattern.attitude, (scan.width, scan.height), scale, pattern.negative)
     for _ in range(2):
         _drop(design, film, columns)
         if columns.ok.sum() < 3:
@@ -283,7 +279,7 @@ def _measured(
         if not len(again):
             break
         columns.predicted = near
-        _look(scan, design, linear, near, 0.1 * scale, columns, again)
+        _look(scan, shown, linear, near, 0.1 * scale, columns, again)
     if columns.ok.sum() < max(3, n - _MISSING):
         ids = design.ids
         lost = [f"{ids[k]}: {columns.why[k]}" for k in np.flatnonzero(~columns.ok)]
@@ -298,16 +294,17 @@ def _measured(
 
 @dataclass(frozen=True)
 class _Film:
-    """How the film lies in the scan, the size of this, and pixels per mm."""
+    """How the film lies in the scan, the size of this, pixels per mm, and whether this is a negative."""
 
     attitude: Attitude
     size: tuple[int, int]
     scale: float
+    negative: bool
 
     @classmethod
     def of(cls, result: FiducialResult, attitude: Attitude) -> _Film:
         """The film of a result in an attitude."""
-        return cls(attitude, result.size, result.px_per_mm)
+        return cls(attitude, result.size, result.px_per_mm, result.negative)
 
     def coordinates(self, xy: Array) -> Array:
         """Scan coordinates (mm) of pixels (n, 2)."""
@@ -329,12 +326,14 @@ class _Fitted:
 
 
 class _Places(Protocol):
-    """Pixels (n, 2) of marks with their covariances (n, 2, 2)."""
+    """Pixels (n, 2) of marks with their covariances (n, 2, 2), and what these have in common."""
 
     @property
     def xy(self) -> Array: ...
     @property
     def cov(self) -> Array: ...
+    @property
+    def common(self) -> Array: ...
 
 
 @dataclass
@@ -348,6 +347,7 @@ class _Columns:
     likeness: Array
     psf_px: Array
     predicted: Array
+    common: Array
 
     @classmethod
     def empty(cls, n: int) -> _Columns:
@@ -360,6 +360,7 @@ class _Columns:
             np.zeros(n),
             np.full(n, np.nan),
             none.copy(),
+            np.zeros((n, 2, 2)),
         )
 
 
@@ -382,7 +383,7 @@ def _look(
         sigma = (
             float(np.sqrt(np.nanmax(np.diag(found.cov[i])))) if np.isfinite(found.cov[i]).all() else np.inf
         )
-        limit = max(_MOST_SIGMA_PX, _MOST_SIGMA_MM * scale)
+        limit = _OFF_MM * scale  # beyond it the others could not tell whether this is the mark
         why: str = ""
         moved = float(np.hypot(*(found.xy[i] - at[k])))
         if one.seen[0] < 0.5:
@@ -396,7 +397,7 @@ def _look(
         elif sigma > limit:
             why = Reason(f"its standard deviation would be {sigma:.2g} px", Code.UNCERTAIN)
         columns.ok[k], columns.why[k] = why == "", why
-        columns.xy[k], columns.cov[k] = found.xy[i], found.cov[i]
+        columns.xy[k], columns.cov[k], columns.common[k] = found.xy[i], found.cov[i], found.common[i]
         columns.likeness[k], columns.psf_px[k] = one.correlation[0], level * one.psf_px[0]
         columns.predicted[k] = at[k]
 
@@ -404,7 +405,7 @@ def _look(
 def _fitted(design: FiducialDesign, film: _Film, marks: _Places, keep: Mask, kind: Kind) -> _Fitted | Failure:
     """Fit a transformation to some of the marks; the weights contain the irregular deformation of film."""
     turn = film.attitude.matrix / film.scale
-    cov = turn.T @ marks.cov[keep] @ turn + _FILM_MM**2 * np.eye(2)
+    cov = turn.T @ (marks.cov - marks.common)[keep] @ turn + _FILM_MM**2 * np.eye(2)
     points = ImagePoints(tuple(np.array(design.ids)[keep].tolist()), film.coordinates(marks.xy[keep]), cov)
     target, sigma = design.xy[keep], np.repeat(design.sigma[keep][:, None], 2, axis=1)
     fit = fit_mapping(TRANSFORMS[kind], points, target, sigma)
@@ -496,6 +497,8 @@ def _result(
         px_per_mm=film.scale,
         xy=columns.xy,
         cov=columns.cov,
+        common=columns.common,
+        negative=film.negative,
         ok=ok,
         why=tuple(columns.why),
         predicted=film.pixels(fitted.model, design),
@@ -503,9 +506,46 @@ def _result(
         psf_px=columns.psf_px,
         kind=kind,
         fit=fitted.fit,
+        shared=_shared(design, film, columns, fitted, kind),
         residuals=_spread(fitted.residuals, ok),
         notes=(),
     )
+
+
+def _shared(design: FiducialDesign, film: _Film, columns: _Places, fitted: _Fitted, kind: Kind) -> Array:
+    """What errors of learnt marks add to the covariance of the transformation's parameters.
+
+    All marks of a kind are displaced alike in the plane of the mark; the transformation is fitted again with
+    these displacements.
+    """
+    ok: Mask = np.asarray(np.isfinite(columns.xy).all(axis=1))
+    linear = film.scale * film.attitude.matrix
+    total = np.zeros((len(fitted.fit.values),) * 2)
+    for name, mark in design.marks.items():
+        rows = [k for k in np.flatnonzero(ok).tolist() if design.points[k].mark == name]
+        if mark.learnt is None or not rows:
+            continue
+        moves = {k: moves_of(design, k, linear)[0] for k in rows}
+        back = [np.linalg.inv(moves[k]) @ columns.common[k] @ np.linalg.inv(moves[k]).T for k in rows]
+        value, vector = np.linalg.eigh(np.mean(back, axis=0))
+        for step in (vector * np.sqrt(np.maximum(value, 0.0))).T:
+            xy = columns.xy.copy()
+            for k in rows:
+                xy[k] += moves[k] @ step
+            moved = _fitted(design, film, _Moved(xy, columns.cov, columns.common), ok, kind)
+            if not isinstance(moved, Failure):
+                change = moved.fit.values - fitted.fit.values
+                total += np.outer(change, change)
+    return total
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """Marks at other places."""
+
+    xy: Array
+    cov: Array
+    common: Array
 
 
 def _spread(residuals: Array, ok: Mask) -> Array:
@@ -575,6 +615,7 @@ def _renamed(result: FiducialResult, attitude: Attitude, order: Rows) -> Fiducia
         attitude=attitude,
         xy=result.xy[order],
         cov=result.cov[order],
+        common=result.common[order],
         ok=result.ok[order],
         why=tuple(result.why[i] for i in order),
         likeness=result.likeness[order],
@@ -587,6 +628,7 @@ def _renamed(result: FiducialResult, attitude: Attitude, order: Rows) -> Fiducia
     return replace(
         renamed,
         fit=fitted.fit,
+        shared=_shared(result.design, film, renamed, fitted, result.kind),
         residuals=_spread(fitted.residuals, renamed.ok),
         predicted=film.pixels(fitted.model, result.design),
     )
