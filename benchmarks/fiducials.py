@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import record
 from parts import add_options, executor_of, main_of, outcomes
 from worlds.fiducials import KINDS, OLDER, SHAPES, photograph, write
 
@@ -157,6 +158,11 @@ def line(name: str, done: list[dict[str, object]]) -> str:
     wrong = int(((np.abs(e) > WRONG_PX) & (np.abs(e) > WRONG_SIGMA * s)).any(axis=1).sum())
     silent = sum(not d["right"] and not d["ambiguous"] for d in good)
     rms, ratio = np.sqrt((e**2).mean()), np.sqrt(((e / s) ** 2).mean())
+    record(name, "marks", len(e), of=marks)
+    record(name, "wrong", wrong)
+    record(name, "rms", rms, "px")
+    record(name, "errors ÷ sigmas", ratio)
+    record(name, "wrong orientations without a note", silent)
     return (
         f"{name:10}{len(done):6}{len(done) - len(good):9}{f'{len(e)}/{marks}':>9}{rms:8.3f}{ratio:10.2f}"
         f"{wrong:8}{silent:9}{seconds:9.1f}"

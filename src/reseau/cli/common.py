@@ -208,8 +208,8 @@ def overlay_files(path: Path, images: Sequence[Path]) -> dict[Path, Path]:
     return dict(zip(shown, files, strict=True))
 
 
-def out_files(path: Path | None, images: Sequence[Path]) -> dict[Path, Path]:
-    """Return the file of each image: the one that is named, or of several images one each in a folder.
+def out_files(path: Path | None, images: Sequence[Path], one: bool) -> dict[Path, Path]:
+    """Return the file of each image: the one that is named for `one`, or one for each in a folder.
 
     Raises
     ------
@@ -220,7 +220,7 @@ def out_files(path: Path | None, images: Sequence[Path]) -> dict[Path, Path]:
     """
     if path is None:
         return {}
-    if len(images) == 1:
+    if one:
         writable(path, ".json", ".csv")
         return {images[0]: path}
     if path.suffix:

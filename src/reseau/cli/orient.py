@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ..core import vocabulary as v
-from ..core.errors import InputError
+from ..core.errors import InputError, ReseauError
 from ..core.options import Group, Option
 from .common import Computing, out_files, overlay_files, progress, required, say, say_files_left_out, say_json
 from .measure import Output
@@ -166,10 +166,10 @@ def fiducials(
     from ..measure.fiducials.measure import FiducialOptions
     from ..procedures.exposures import photographs_named
 
+    one = len(images) == 1 and not images[0].is_dir()
     images = photographs_named(images)
-    whole = len(images) == 1
     drawn = {} if output.overlay is None else overlay_files(output.overlay, images)
-    outs = out_files(output.out, images)
+    outs = out_files(output.out, images, one)
     named = design.parent == Path() and not design.suffix and not design.exists()
     camera = aerial_camera(design.name) if named else FiducialDesign.read(design)
     turn = None if rotation is None else int(rotation)
@@ -177,24 +177,27 @@ def fiducials(
     documents = []
     with progress("measuring fiducial marks", len(images)) as step:
         for image in images:
-            opened = open_scan(image)
-            found = measure_fiducials(opened, camera, options, sha256_of(image))
-            if image in drawn:
-                if isinstance(found, Failure):
-                    found.overlay(read_image(image), drawn[image])
-                else:
+            try:
+                opened = open_scan(image)
+                found = measure_fiducials(opened, camera, options, sha256_of(image))
+                if image in drawn and not isinstance(found, Failure):
                     found.overlay(opened.picture(), drawn[image])
-            step()
-            if isinstance(found, Failure) and not whole:
-                typer.echo(f"reseau: {image}: {found.reason}", err=True)
+                elif image in drawn:
+                    found.overlay(read_image(image), drawn[image])
+                document = required(found, image).document()
+            except ReseauError as error:
+                if one:
+                    raise
+                typer.echo(f"reseau: {error}", err=True)
                 continue
-            document = required(found, image).document()
+            finally:
+                step()
             documents.append(document)
-            each = replace(output, out=outs.get(image), as_json=whole and output.as_json)
-            each.deliver(document, csv_of, _marks if whole or not output.as_json else lambda _: "")
-    if not whole and output.as_json:
+            each = replace(output, out=outs.get(image), as_json=one and output.as_json)
+            each.deliver(document, csv_of, _marks if one or not output.as_json else lambda _: "")
+    if not one and output.as_json:
         say_json([document.to_dict() for document in documents])
-    elif not whole:
+    elif not one:
         say(f"{len(documents)} of {len(images)} photographs oriented\n")
     return 0 if len(documents) == len(images) else 1
 

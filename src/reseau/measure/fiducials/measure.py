@@ -31,7 +31,7 @@ from .search import (
     least_scales,
     overview_size,
 )
-from .windows import match_marks, moves_of, tracked
+from .windows import fit_of, match_marks, moves_of, tracked
 
 _STATED, _UNKNOWN = 0.03, 0.08
 """Relative uncertainty of the scale that a file states, and of one step of those that are tried."""
@@ -53,6 +53,8 @@ _FILM_MM = 0.005
 """Irregular deformation of film and scanner between marks, one sigma: the least weight of their distances."""
 _UNLIKE_MM = 0.02
 """Least rms of the residuals of a contradicted transformation, per 100 mm of the pattern's radius."""
+_CERTAIN = float(np.log(1000))
+"""Logarithm of the odds at which images of marks decide between attitudes."""
 _AFFINE = 0.006
 """Largest shear or difference of scales that film and scanners have."""
 _OFF_MM = 0.15
@@ -154,7 +156,7 @@ def measure_fiducials(
     if best is None:
         assert failure is not None
         return failure
-    best = _oriented(best, options)
+    best = _oriented(scan, best, options)
     return replace(best, notes=(*best.notes, *notes, *_remarks(best)))
 
 
@@ -555,19 +557,16 @@ def _spread(residuals: Array, ok: Mask) -> Array:
     return every
 
 
-def _oriented(result: FiducialResult, options: FiducialOptions) -> FiducialResult:
-    """Compare the other attitudes in which the same marks fit: the coordinates may tell, or nothing does."""
-    own = _misfit(result, result.attitude, np.arange(len(result.ok)))
-    rivals = []
-    for attitude in attitudes(options.rotation, options.mirrored):
-        if attitude == result.attitude:
-            continue
-        order = _exchanged(result, attitude)
-        if order is not None:
-            rivals.append((_misfit(result, attitude, order), attitude, order))
-    if not rivals:
+def _oriented(scan: Scan, result: FiducialResult, options: FiducialOptions) -> FiducialResult:
+    """Compare the attitudes in which the same marks fit: images and coordinates may tell, or nothing does."""
+    ways = attitudes(options.rotation, options.mirrored)
+    orders = {attitude: _exchanged(result, attitude) for attitude in ways}
+    fits = {attitude: order for attitude, order in orders.items() if order is not None}
+    likelihood = _likelihoods(scan, result, fits)
+    likely = [attitude for attitude in fits if likelihood[attitude] > max(likelihood.values()) - _CERTAIN]
+    every = [(_misfit(result, attitude, fits[attitude]), attitude, fits[attitude]) for attitude in likely]
+    if not every:
         return result
-    every = [(own, result.attitude, np.arange(len(result.ok))), *rivals]
     best = min(every, key=lambda each: each[0])
     others = [each for each in every if each[1] != best[1]]
     radius = float(np.hypot(*(result.design.xy - result.design.xy.mean(axis=0)).T).max())
@@ -598,14 +597,33 @@ def _exchanged(result: FiducialResult, attitude: Attitude) -> Rows | None:
     extent = float(np.ptp(design.xy))
     if len(set(order.tolist())) < len(order) or away.min(axis=1).max() > 0.01 * extent:
         return None
-    for k, j in enumerate(order.tolist()):
-        one = formed_mark(design, k, 8.0 / reach_of(design.marks[design.points[k].mark]) * attitude.matrix)
-        other = formed_mark(
-            design, j, 8.0 / reach_of(design.marks[design.points[j].mark]) * result.attitude.matrix
-        )
-        if one.shape != other.shape or np.corrcoef(one.ravel(), other.ravel())[0, 1] < 0.9:
-            return None
     return np.asarray(order, dtype=np.intp)
+
+
+def _likelihoods(scan: Scan, result: FiducialResult, fits: dict[Attitude, Rows]) -> dict[Attitude, float]:
+    """Logarithms of the likelihoods of attitudes by the images of the marks; equal where these are alike."""
+    design = result.design.reversed() if result.negative else result.design
+    own = _linear_of(design, result.predicted, result.px_per_mm * result.attitude.matrix)
+    seen: dict[tuple[int, bytes], tuple[float, float]] = {}
+    found = {}
+    for attitude, order in fits.items():
+        linear = own @ np.linalg.inv(result.attitude.matrix) @ attitude.matrix
+        each = {}
+        for k, at in enumerate(order.tolist()):
+            if not result.ok[at]:
+                continue
+            small = 8.0 / reach_of(design.marks[design.points[k].mark]) / result.px_per_mm
+            key = at, np.rint(20 * formed_mark(design, k, small * linear)).astype(np.int8).tobytes()
+            if key not in seen:
+                seen[key] = fit_of(scan, design, k, linear, result.xy[at], float(result.psf_px[at]))
+            each[at] = seen[key]
+        found[attitude] = each
+    total = dict.fromkeys(fits, 0.0)
+    for at in np.flatnonzero(result.ok).tolist():
+        count = min(each[at] for each in found.values())[1]  # as the best image leaves them
+        for attitude, each in found.items():
+            total[attitude] -= count / 2 * float(np.log(max(each[at][0], 1e-12)))
+    return total
 
 
 def _renamed(result: FiducialResult, attitude: Attitude, order: Rows) -> FiducialResult:

@@ -203,6 +203,38 @@ def moves_of(design: FiducialDesign, k: int, linear: Array) -> tuple[Array, floa
     return own, float(1 / np.sqrt(abs(np.linalg.det(own))))
 
 
+def fit_of(
+    scan: Scan, design: FiducialDesign, k: int, linear: Array, at: Array, psf_px: float
+) -> tuple[float, float]:
+    """Variance of the grey values around a mark about its image at a place, and how many independent ones.
+
+    Parameters
+    ----------
+    scan, design, k, linear
+        As of :func:`tracked`.
+    at : ndarray (2,)
+        Place of the mark, pixels of the scan.
+    psf_px : float
+        Width of the point-spread function, pixels of the scan.
+    """
+    level, point = _reduction(design, k, linear), design.points[k]
+    mark, scale = design.marks[point.mark], np.sqrt(abs(np.linalg.det(linear))) / level
+    half = int(np.ceil((reach_of(mark) + margin_of(mark)) * scale))
+    grey, inside, first = grey_window(scan, at, half, level)
+    shape = shape_of(mark, linear / level @ turned(point.turn_deg), 0.5, np.ones(3))
+    along = np.arange(2 * half + 1.0)[None]
+    window, form = Window(along, along, PixelResponse()), np.zeros((1, shape.parameters))
+    share = shape.image(((at - first) / level)[None], np.array([psf_px / level]), form, np.array([0]), window)
+    y, x = np.mgrid[-1 : 1 : grey.shape[0] * 1j, -1 : 1 : grey.shape[1] * 1j]
+    columns = np.stack([np.ones_like(x), x, y, share[0]], axis=-1)[inside]
+    left = np.zeros(grey.shape)
+    left[inside] = grey[inside] - columns @ np.linalg.lstsq(columns, grey[inside], rcond=None)[0]
+    variance = float((left**2).mean())
+    near = float((left[1:] * left[:-1]).mean() + (left[:, 1:] * left[:, :-1]).mean()) / 2
+    a = float(np.clip(near / max(variance, 1e-12), 0.0, 0.95))
+    return variance, left.size * ((1 - a) / (1 + a)) ** 2
+
+
 def _spread_by_grey(found: list[Matches], formed: list[Array]) -> Callable[[Array], Array]:
     """Standard deviation of residuals as a function of the grey value that was formed.
 
