@@ -25,7 +25,16 @@ from ..matching import Matches, match
 from ..matching.patches import MatchOptions
 from .forms import reach_of
 from .learnt import OWN_PSF, LearntShape
-from .search import Candidates, Pattern, attitudes, find_patterns, least_scales, overview_size, turned
+from .search import (
+    Candidates,
+    Pattern,
+    attitudes,
+    find_patterns,
+    least_scales,
+    odds_of_same,
+    overview_size,
+    turned,
+)
 from .windows import grey_window, quiet
 
 if TYPE_CHECKING:
@@ -35,8 +44,6 @@ _CLICK_PX = float(np.sqrt(1 / 12))
 """Standard deviation of a place that is given to the pixel."""
 _AIM_PX = 3.0
 """Largest distance of a centre of symmetry from the place that was given for it, one sigma."""
-_UNEVEN = 0.05
-"""Difference of a mark from itself, turned, that its making explains, in units of its contrast, one sigma."""
 _RIM = 0.85
 """Share of the radius beyond which the surroundings of a mark are seen."""
 _WITHIN, _STEP = 0.09, 0.16
@@ -228,8 +235,20 @@ def _example(scan: Scan, place: Array, reach: float) -> _Example | Failure:
         return seen
     folds, place, cov = found or (1, place, _CLICK_PX**2 * np.eye(2))
     off = place - seen.place
-    left = reach - float(np.hypot(*off))
-    return replace(seen, at=seen.at + off, cov=cov, place=place, reach=left, folds=folds)
+    at, left = seen.at + off, reach - float(np.hypot(*off))
+    values, noise = _averaged(seen.values, at, folds), seen.noise / np.sqrt(folds)
+    return replace(seen, values=values, at=at, cov=cov, place=place, reach=left, noise=noise, folds=folds)
+
+
+def _averaged(values: Array, at: Array, folds: int) -> Array:
+    """Mean of an image (h, w) and of itself, turned about its centre of symmetry."""
+    y, x = np.mgrid[: len(values), : values.shape[1]].astype(np.float64)
+    off = np.stack([x, y], axis=-1) - at
+    each = [values]
+    for i in range(1, folds):
+        places = off @ turned(360.0 * i / folds).T + at
+        each.append(scipy.ndimage.map_coordinates(values, np.moveaxis(places, -1, 0)[::-1], order=3))
+    return np.asarray(np.mean(each, axis=0))
 
 
 def _image(scan: Scan, centre: Array, reach: float) -> _Example | Failure:
@@ -286,8 +305,7 @@ def _symmetry(scan: Scan, seen: _Example, place: Array) -> tuple[int, Array, Arr
         to = np.linalg.inv(np.eye(2) - turn)
         point = to @ (matched.xy[0] - turn @ seen.at) + first
         away = float(((point - place) ** 2).sum()) / (2 * _AIM_PX**2)
-        uneven = np.exp(-((tau / _UNEVEN) ** 2) / 2 - away) * np.sqrt(2 / np.pi) / _UNEVEN
-        if uneven > 1 / whole:
+        if odds_of_same(tau, whole) * np.exp(-away) > 1:
             return folds, point, to @ matched.cov[0] @ to.T
     return None
 

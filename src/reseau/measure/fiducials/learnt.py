@@ -7,9 +7,12 @@ scan from which it was learnt; a sharper scan asks for a negative variance, whic
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from ...core.data import Array, Rows
 from ...io import LearntMark
@@ -89,9 +92,9 @@ class LearntShape:
         places = away[::-1] + np.array(self.learnt.at)[::-1, None, None] + _ROOM
         ratio2 = abs(float(np.linalg.det(matrix)))
         variance = ratio2 * (width**2 - OWN_PSF**2) + max(ratio2 - 1, 0.0) / 12  # coarser pixels are larger
-        fields = _filtered(self.learnt, variance, 1 if parts == 1 else 4)
         value, *slopes = (
-            scipy.ndimage.map_coordinates(field, places, order=3, mode="constant") for field in fields
+            scipy.ndimage.map_coordinates(field, places, order=3, mode="constant")
+            for field in self._filtered(variance, 1 if parts == 1 else 4)
         )
         if parts == 1:
             return np.asarray(value[None])
@@ -103,15 +106,20 @@ class LearntShape:
         by_turn = (slope * swept).sum(axis=0) * self.step[1]
         return np.stack([value, *by_xy, by_width, by_size, by_turn])
 
+    @cached_property
+    def _spectrum(self) -> tuple[NDArray[Any], tuple[int, int]]:
+        """Spectrum of the image, which fades around its border, and the size of that."""
+        values = np.pad(np.array(self.learnt.values, dtype=np.float64) / 1000, _ROOM, mode="linear_ramp")
+        return np.fft.rfft2(values), (len(values), values.shape[1])
 
-def _filtered(learnt: LearntMark, variance: float, fields: int) -> list[Array]:
-    """The image blurred by a variance (px²), its derivatives in x and y, and its Laplacian."""
-    values = np.pad(np.array(learnt.values, dtype=np.float64) / 1000, _ROOM, mode="linear_ramp")
-    ky, kx = 2 * np.pi * np.fft.fftfreq(len(values))[:, None], 2 * np.pi * np.fft.rfftfreq(values.shape[1])
-    square = kx**2 + ky**2
-    spectrum = np.fft.rfft2(values) * np.exp(-variance * square / 2)
-    each = [spectrum, 1j * kx * spectrum, 1j * ky * spectrum, -square * spectrum]
-    return [np.fft.irfft2(one, values.shape) for one in each[:fields]]
+    def _filtered(self, variance: float, fields: int) -> list[Array]:
+        """The image blurred by a variance (px²), its derivatives in x and y, and its Laplacian."""
+        whole, (high, wide) = self._spectrum
+        ky, kx = 2 * np.pi * np.fft.fftfreq(high)[:, None], 2 * np.pi * np.fft.rfftfreq(wide)
+        square = kx**2 + ky**2
+        spectrum = whole * np.exp(-variance * square / 2)
+        each = [spectrum, 1j * kx * spectrum, 1j * ky * spectrum, -square * spectrum]
+        return [np.fft.irfft2(one, (high, wide)) for one in each[:fields]]
 
 
 def thickness_of(learnt: LearntMark) -> float:

@@ -30,6 +30,7 @@ from .search import (
     formed_mark,
     least_scales,
     overview_size,
+    same_figure,
 )
 from .windows import fit_of, match_marks, moves_of, tracked
 
@@ -604,20 +605,27 @@ def _likelihoods(scan: Scan, result: FiducialResult, fits: dict[Attitude, Rows])
     """Logarithms of the likelihoods of attitudes by the images of the marks; equal where these are alike."""
     design = result.design.reversed() if result.negative else result.design
     own = _linear_of(design, result.predicted, result.px_per_mm * result.attitude.matrix)
-    seen: dict[tuple[int, bytes], tuple[float, float]] = {}
+    seen: dict[int, list[tuple[Any, tuple[float, float]]]] = {}
+
+    def fit(k: int, at: int, linear: Array) -> tuple[float, float]:
+        """Fit of the image of a mark at the place of one; what shows the same figure fits the same."""
+        mark = design.marks[design.points[k].mark]
+        fine = 8.0 / reach_of(mark) if mark.learnt is None else mark.learnt.px_per_mm
+        image = formed_mark(design, k, fine / result.px_per_mm * linear)
+        noise = 0.0 if mark.learnt is None else mark.learnt.noise / 1000
+        for other, found in seen.setdefault(at, []):
+            if other.shape == image.shape and same_figure(image, other, noise):
+                return found
+        fitted = fit_of(scan, design, k, linear, result.xy[at], float(result.psf_px[at]))
+        seen[at].append((image, fitted))
+        return fitted
+
     found = {}
-    for attitude, order in fits.items():
+    # The own attitude first: others that show the same figures fit as it does.
+    for attitude in sorted(fits, key=lambda each: each != result.attitude):
         linear = own @ np.linalg.inv(result.attitude.matrix) @ attitude.matrix
-        each = {}
-        for k, at in enumerate(order.tolist()):
-            if not result.ok[at]:
-                continue
-            small = 8.0 / reach_of(design.marks[design.points[k].mark]) / result.px_per_mm
-            key = at, np.rint(20 * formed_mark(design, k, small * linear)).astype(np.int8).tobytes()
-            if key not in seen:
-                seen[key] = fit_of(scan, design, k, linear, result.xy[at], float(result.psf_px[at]))
-            each[at] = seen[key]
-        found[attitude] = each
+        rows = enumerate(fits[attitude].tolist())
+        found[attitude] = {at: fit(k, at, linear) for k, at in rows if result.ok[at]}
     total = dict.fromkeys(fits, 0.0)
     for at in np.flatnonzero(result.ok).tolist():
         count = min(each[at] for each in found.values())[1]  # as the best image leaves them

@@ -30,6 +30,10 @@ from .learnt import OWN_PSF
 _MARK_PX, _BOLD_PX, _LONGEST = 24.0, 1.0, 3000
 """Size of the smallest mark with its surroundings, and width of its boldest part, in the overview; largest
 longer side of that."""
+_UNEVEN = 0.05
+"""Difference of a mark from itself, turned, that its making explains, in units of its contrast, one sigma."""
+_SAME_FORM = 0.98
+"""Correlation of two images of marks from which the same places look like both: noise of a learnt mark."""
 _CANDIDATES = 80
 """Most candidates for each form of a mark."""
 _LEAST = 0.35
@@ -141,6 +145,28 @@ def formed_mark(design: FiducialDesign, k: int, linear: Array, psf: float = 0.8)
     return np.asarray(share if mark.polarity == "bright" else -share, dtype=np.float32)
 
 
+def odds_of_same(difference: float, whole: float) -> float:
+    """Odds that two images of a mark, or one and itself when it is turned, show the same figure.
+
+    Parameters
+    ----------
+    difference : float
+        Rms difference beyond noise on the mark, in units of its contrast. It is normal if the mark is made
+        unevenly, and as probable as any up to `whole` if the figures are two.
+    whole : float
+        Rms value of the mark there.
+    """
+    uneven = np.exp(-((difference / _UNEVEN) ** 2) / 2) * np.sqrt(2 / np.pi) / _UNEVEN
+    return float(uneven * whole)
+
+
+def same_figure(one: NDArray[np.float32], other: NDArray[np.float32], noise: float) -> bool:
+    """Whether two images (h, w) of marks show the same figure; `noise` is that of each."""
+    on = np.maximum(np.abs(one), np.abs(other)) > 0.1
+    square = ((one[on] - other[on]) ** 2).mean() - 2 * noise**2
+    return odds_of_same(float(np.sqrt(max(square, 0.0))), float(np.sqrt((one[on] ** 2).mean()))) > 1
+
+
 def turned(degrees: float) -> Array:
     """Rotation matrix, counter-clockwise with y up."""
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
@@ -193,8 +219,8 @@ class Candidates:
 
     def __init__(self, overview: NDArray[np.float32], step: float, reduction: float = 1.0) -> None:
         self.overview, self.step, self.reduction = overview, step, reduction
-        self._seen: dict[bytes, list[tuple[Array, Array]]] = {}
-        self._formed: dict[tuple[object, ...], bytes] = {}
+        self._seen: list[tuple[NDArray[np.float32], list[tuple[Array, Array]]]] = []
+        self._known: dict[tuple[object, ...], list[tuple[Array, Array]]] = {}
         self._flat: dict[int, NDArray[np.bool_]] = {}
 
     @classmethod
@@ -207,15 +233,20 @@ class Candidates:
         """Positions (m, 2) and correlations (m,) of a mark; `linear` is from camera coordinates to pixels."""
         point = design.points[k]
         turn = design.marks[point.mark], np.rint(1e6 * linear @ turned(point.turn_deg)).tobytes()
-        if turn not in self._formed:
-            template = formed_mark(design, k, linear)
-            key = self._formed[turn] = np.rint(20 * template).astype(np.int8).tobytes()
-            if key not in self._seen:
-                side = len(template)
-                if side not in self._flat:
-                    self._flat[side] = _spread(self.overview, side) < self.step
-                self._seen[key] = _peaks(self.overview, template, self._flat[side])
-        return self._seen[self._formed[turn]][negative]
+        if turn not in self._known:
+            self._known[turn] = self._found(formed_mark(design, k, linear))
+        return self._known[turn][negative]
+
+    def _found(self, template: NDArray[np.float32]) -> list[tuple[Array, Array]]:
+        """Those of one image of a mark, and of its negative; of images that hardly differ the same."""
+        side = len(template)
+        for other, found in self._seen:
+            if len(other) == side and np.corrcoef(template.ravel(), other.ravel())[0, 1] > _SAME_FORM:
+                return found
+        if side not in self._flat:
+            self._flat[side] = _spread(self.overview, side) < self.step
+        self._seen.append((template, _peaks(self.overview, template, self._flat[side])))
+        return self._seen[-1][1]
 
 
 def find_patterns(
