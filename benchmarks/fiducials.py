@@ -67,10 +67,11 @@ def truth_of(image: Path) -> dict[str, Any]:
 
 
 def learnt(image: Path, verbose: bool) -> FiducialDesign | Failure:
-    """The camera of a photograph with marks learnt from it, each kind from the first of its marks."""
+    """The camera of a photograph with marks learnt from it; three marks, one of each kind, are placed."""
     design, truth = design_of(image), truth_of(image)
     marks = {point.mark: point.id for point in reversed(design.points)}
-    places = {name: tuple(np.rint(truth["xy"][design.ids.index(name)]).tolist()) for name in marks.values()}
+    names = [*marks.values(), *(point.id for point in design.points[:3])]
+    places = {name: tuple(np.rint(truth["xy"][design.ids.index(name)]).tolist()) for name in names}
     reach = max(reach_of(mark) + margin_of(mark) for mark in design.marks.values())
     found = learn_marks(open_scan(image), design, places, 2 * reach * truth["px_per_mm"])
     if verbose and not isinstance(found, Failure):

@@ -118,6 +118,16 @@ def test_the_place_that_was_given_is_the_point_of_an_asymmetric_mark() -> None:
     assert mark.covariance[0] == pytest.approx(1 / 12)  # of a pixel
 
 
+def test_one_place_in_a_square_of_marks_leaves_a_mirrored_film_possible() -> None:
+    square = {"1": (20.0, -20.0), "2": (-20.0, -20.0), "3": (-20.0, 20.0), "4": (20.0, 20.0)}
+    image, places = photograph(square)
+    assert len(learnt(image, camera(square), places[0], 46.0, "1").others) == 1
+    every = {name: tuple(place) for name, place in zip("123", np.rint(places), strict=False)}
+    found = learn_marks(scan_of(image), camera(square), every, 46.0)
+    assert not isinstance(found, Failure)
+    assert found.others == ()
+
+
 def test_what_does_not_recur_is_not_learnt() -> None:
     image, places = photograph(UNEVEN, without=("1", "3"))
     found = learn_marks(scan_of(image), camera(UNEVEN), {"2": tuple(np.rint(places[1]))}, 46.0)

@@ -26,6 +26,7 @@ from ..matching.patches import MatchOptions
 from .forms import reach_of
 from .learnt import OWN_PSF, LearntShape
 from .search import (
+    Attitude,
     Candidates,
     Pattern,
     attitudes,
@@ -33,6 +34,7 @@ from .search import (
     least_scales,
     odds_of_same,
     overview_size,
+    same_places,
     turned,
 )
 from .windows import grey_window, quiet
@@ -62,6 +64,8 @@ class LearntDesign(Overlaid):
         The marks in the example, in pixels of the scan.
     folds : dict of str to int
         For each kind in how many positions it looks the same when it is turned; 1 if in one.
+    others : tuple of Attitude
+        Other ways in which the film of the example may lie: the places that were given do not tell.
 
     Examples
     --------
@@ -75,6 +79,7 @@ class LearntDesign(Overlaid):
     design: FiducialDesign
     pattern: Pattern
     folds: dict[str, int]
+    others: tuple[Attitude, ...] = ()
 
     def lines(self) -> list[str]:
         """What was learnt: one line for each kind, and one for the scan."""
@@ -89,6 +94,9 @@ class LearntDesign(Overlaid):
                 f"its centre of symmetry (the same in {folds} positions)" if folds > 1 else "the place given"
             )
             lines.append(f"{name}: a {mark.polarity} mark, measured at {how}, ± {at:.2g} px")
+        if self.others:
+            names = ", ".join(map(str, self.others))
+            lines.append(f"note: the film may also lie {names}; give the places of three marks to decide")
         return lines
 
     def layers(self) -> list[Layer]:
@@ -125,7 +133,8 @@ def learn_marks(
     design : FiducialDesign
         The camera: coordinates of its marks, and which of them are of one kind.
     places : mapping of str to (float, float)
-        For each kind that is to be learnt the name of one of its marks, and where this lies, in pixels.
+        For each kind that is to be learnt the name of one of its marks, and where this lies, in pixels. More
+        marks of a kind tell how the film lies.
     mark_px : float
         Diameter of a mark with its even surroundings, pixels.
 
@@ -137,8 +146,8 @@ def learn_marks(
     Raises
     ------
     UsageError
-        When a name is not in the design, two are of one kind, or a place is not in the scan; when the
-        diameter is not from 8 to 900 px.
+        When a name is not in the design, a place is not in the scan, or the diameter is not from 8 to
+        900 px.
 
     Examples
     --------
@@ -166,15 +175,18 @@ def learn_marks(
         if isinstance(image, Failure):
             return Failure(f"{design.ids[k]}: {image.reason}", image.code, places=image.places)
     learnt = {k: image for k, image in images.items() if not isinstance(image, Failure)}
-    placed = _placed(scan, design, learnt)
-    if placed is None:
+    known = {design.ids.index(name): np.array(place) for name, place in places.items()}
+    fits = _placed(scan, design, learnt, known | {k: image.place for k, image in learnt.items()})
+    if not fits:
         return Failure(
             f"the marks of {design.name!r} do not recur where its coordinates say; check the places, the "
             "kinds of marks and their rotations in the design",
             Code.NOT_FOUND,
         )
-    own = _with_images(design, learnt, placed.linear)
-    return LearntDesign(own, placed, {design.points[k].mark: image.folds for k, image in learnt.items()})
+    placed, *rest = fits
+    folds = {design.points[k].mark: image.folds for k, image in learnt.items()}
+    others = tuple(each.attitude for each in rest if same_places(each, placed))
+    return LearntDesign(_with_images(design, learnt, placed.linear), placed, folds, others)
 
 
 def _rows(scan: Scan, design: FiducialDesign, places: Mapping[str, tuple[float, float]]) -> list[int]:
@@ -185,11 +197,8 @@ def _rows(scan: Scan, design: FiducialDesign, places: Mapping[str, tuple[float, 
             raise UsageError(f"has no mark {name!r}", where=design.name, do=f"it has {', '.join(design.ids)}")
         if not (0 <= x < scan.width and 0 <= y < scan.height):
             raise UsageError(f"mark {name}: ({x:g}, {y:g}) is outside the scan", where=scan.name)
-        kind = design.points[design.ids.index(name)].mark
-        if kind in kinds:
-            raise UsageError(f"marks {kinds[kind]} and {name} are of one kind, {kind!r}", where=design.name)
-        kinds[kind] = name
-    return [design.ids.index(name) for name in places]
+        kinds.setdefault(design.points[design.ids.index(name)].mark, name)
+    return [design.ids.index(name) for name in kinds.values()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,12 +342,14 @@ def _turned_match(grey: NDArray[Any], inside: Mask, seen: _Example, turn: Array,
     )
 
 
-def _placed(scan: Scan, design: FiducialDesign, learnt: dict[int, _Example]) -> Pattern | None:
-    """The pattern of the marks in the example, in pixels of the scan, at any scale and in any attitude."""
+def _placed(
+    scan: Scan, design: FiducialDesign, learnt: dict[int, _Example], places: dict[int, Array]
+) -> list[Pattern]:
+    """Patterns of the marks in the example, in pixels of the scan, the best of each attitude at any scale."""
     low, high = least_scales(design, (scan.width, scan.height))
     steps = max(1, int(np.ceil(np.log(high / low) / np.log(1 + _STEP))))
     grid = np.geomspace(high, low, steps + 1)
-    best: Pattern | None = None
+    best: dict[Attitude, Pattern] = {}
     seen: dict[int, Candidates] = {}
     for scale in ((grid[1:] + grid[:-1]) / 2).tolist():
         for attitude in attitudes(None, None):
@@ -347,20 +358,22 @@ def _placed(scan: Scan, design: FiducialDesign, learnt: dict[int, _Example]) -> 
             if size not in seen:
                 seen[size] = Candidates.of_scan(scan, size)
             candidates, reduction = seen[size], seen[size].reduction
-            known = {k: (image.place + 0.5) / reduction - 0.5 for k, image in learnt.items()}
+            known = {k: (place + 0.5) / reduction - 0.5 for k, place in places.items()}
             found = find_patterns(
                 candidates, own, scale / reduction, _WITHIN, [(attitude, False)], 8.0, known
             )
             for pattern in found:
-                if best is None or pattern.score > best.score:
-                    best = Pattern(
+                if np.isnan(pattern.xy[list(known)]).any():
+                    continue  # it explains the others only
+                if attitude not in best or pattern.score > best[attitude].score:
+                    best[attitude] = Pattern(
                         attitude,
                         reduction * pattern.linear,
                         (pattern.shift + 0.5) * reduction - 0.5,
                         (pattern.xy + 0.5) * reduction - 0.5,
                         pattern.likeness,
                     )
-    return best
+    return sorted(best.values(), key=lambda each: -each.score)
 
 
 def _with_images(design: FiducialDesign, learnt: dict[int, _Example], linear: Array) -> FiducialDesign:

@@ -31,6 +31,7 @@ from .search import (
     least_scales,
     overview_size,
     same_figure,
+    same_places,
 )
 from .windows import fit_of, match_marks, moves_of, tracked
 
@@ -236,15 +237,9 @@ def _at_scale(
     # Attitudes that use the same candidates are compared after the measurement.
     distinct: list[Pattern] = []
     for pattern in patterns:
-        if not any(_same_places(pattern, other) for other in distinct):
+        if not any(same_places(pattern, other) for other in distinct):
             distinct.append(pattern)
     return [(pattern, reduction) for pattern in distinct]
-
-
-def _same_places(one: Pattern, other: Pattern) -> bool:
-    a, b = (p.xy[np.isfinite(p.xy).all(axis=1)] for p in (one, other))
-    near = np.hypot(*(a[:, None] - b[None]).transpose(2, 0, 1)).min(axis=1) < 3.0
-    return bool(near.all()) and one.negative == other.negative
 
 
 def _measured(

@@ -167,6 +167,13 @@ def same_figure(one: NDArray[np.float32], other: NDArray[np.float32], noise: flo
     return odds_of_same(float(np.sqrt(max(square, 0.0))), float(np.sqrt((one[on] ** 2).mean()))) > 1
 
 
+def same_places(one: Pattern, other: Pattern) -> bool:
+    """Whether two patterns have the same marks, each perhaps with another name."""
+    a, b = (p.xy[np.isfinite(p.xy).all(axis=1)] for p in (one, other))
+    near = np.hypot(*(a[:, None] - b[None]).transpose(2, 0, 1)).min(axis=1) < 3.0
+    return bool(near.all()) and one.negative == other.negative
+
+
 def turned(degrees: float) -> Array:
     """Rotation matrix, counter-clockwise with y up."""
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
