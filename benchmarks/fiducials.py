@@ -154,6 +154,7 @@ def line(name: str, done: list[dict[str, object]]) -> str:
     marks = sum(int(d["marks"]) for d in done)  # type: ignore[call-overload]
     seconds = float(np.mean([d["seconds"] for d in done]))  # type: ignore[arg-type]
     if not good:
+        record(name, "marks", 0, of=marks)
         return f"{name:10}{len(done):6}{len(done):9}{'0/' + str(marks):>9}{'':40}{seconds:5.1f}"
     e, s = (np.concatenate([d[key] for d in good]) for key in ("error", "sigma"))  # type: ignore[misc]
     wrong = int(((np.abs(e) > WRONG_PX) & (np.abs(e) > WRONG_SIGMA * s)).any(axis=1).sum())
