@@ -107,6 +107,10 @@ ENTRIES = (
     Entry("hough", "Film frames of the simulator, beside a Hough method (Cruz et al.)",
           "frames.py --frames 4 --only sharp tilt focus perforations"),
     Entry("film", "Film frames of independent origin", "film_independent.py", (), "independent/film"),
+    Entry("fiducials", "Fiducial marks of any shape, drawn by another renderer; three in ten are negatives",
+          "fiducials.py --kind shapes --count 4"),
+    Entry("fiducials-learnt", "Fiducial marks learnt from one scan, and measured in another one",
+          "fiducials.py --learn --count 1"),
     Entry("oscilloscope-simulated", "Oscilloscopes of the simulator",
           "oscilloscope.py --frames 6 --polynomial 0 --draws 0 --jobs 2"),
     Entry("oscilloscope", "Oscilloscopes of independent origin", "oscilloscope.py --part independent", (),
@@ -132,7 +136,8 @@ SUBJECTS = {
         "disks", "testfield", "boards", "other-boards", "drawn-boards", "reseau-simulated", "reseau",
         "edges", "blurred", "rays")),
     "peers-pictures": ("Film, screens and frames of instruments, beside peers", (
-        "vidicon", "hough", "film", "oscilloscope-simulated", "oscilloscope", "pins")),
+        "vidicon", "hough", "film", "fiducials", "fiducials-learnt", "oscilloscope-simulated",
+        "oscilloscope", "pins")),
     "peers-instruments": ("Instruments and archive, beside peers", ("archive", "gige", "transfer")),
 }  # fmt: skip
 """Pages of the entries: title, and names of the entries."""

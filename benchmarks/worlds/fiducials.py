@@ -28,7 +28,12 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from worlds.pixels import Array, edge
 
-KINDS = ("wild", "wild8", "rings", "dark", "zeiss", "notches", "round", "wedges", "arcs", "checks")
+OLDER = ("wild", "wild8", "rings", "dark", "zeiss", "notches", "round", "wedges", "arcs", "checks")
+SHAPES = (
+    "bars", "brackets", "three", "tees", "floating", "arrows", "polygons", "numbers", "halves", "sectors"
+)  # fmt: skip
+"""Cameras whose marks are of any shape; three in ten of their scans are negatives."""
+KINDS = (*OLDER, *SHAPES)
 _OVER = 6
 
 
@@ -41,13 +46,28 @@ def drawn_part(part: dict[str, Any], u: Array, v: Array, step: float) -> Array:
     """Coverage of one part of a mark at positions relative to its point, mm, y up."""
     at = part.get("at", (0.0, 0.0))
     u, v = _turn(u - at[0], v - at[1], part.get("turn_deg", 0.0))
-    half, r = part["size"] / 2, np.hypot(u, v)
+    half, r = part.get("size", 0.0) / 2, np.hypot(u, v)
     w = part.get("line_width", 0.0) / 2
     shape = part["shape"]
     if shape == "disk":
         return edge(half - r, step)
     if shape == "square":
         return edge(half - np.abs(u), step) * edge(half - np.abs(v), step)
+    if shape == "bar":
+        return edge(half - np.abs(u), step) * edge(w - np.abs(v), step)
+    if shape == "polygon":
+        return edge(_depth(np.array(part["corners"]), u, v), step)
+    if "arms_deg" in part:
+        share = np.zeros_like(u)
+        for turn in part["arms_deg"]:
+            a, b = _turn(u, v, turn)
+            share = np.maximum(share, edge(np.minimum(half - a, a + w), step) * edge(w - np.abs(b), step))
+        return share
+    if shape == "arc" and not w:
+        a, b = (_turn(u, v, part[key])[1] for key in ("from_deg", "to_deg"))
+        wide = part["to_deg"] - part["from_deg"] > 180
+        sides = np.maximum(a, -b) if wide else np.minimum(a, -b)
+        return edge(np.minimum(half - r, sides), step)
     if shape == "cross":
         arms = np.maximum(
             edge(w - np.abs(u), step) * edge(half - np.abs(v), step),
@@ -70,6 +90,33 @@ def drawn_part(part: dict[str, Any], u: Array, v: Array, step: float) -> Array:
         return np.maximum(edge(part["width"] / 2 - r, step), edge(-v, step))
     tooth = edge((-v * slope - np.abs(u)) / np.hypot(1, slope), step)
     return np.maximum(tooth * (v < 0), edge(-part["size"] - v, step))
+
+
+def _depth(corners: Array, u: Array, v: Array) -> Array:
+    """Distance from the outline of a polygon, positive inside."""
+    inside, least = np.zeros(u.shape, bool), np.full(u.shape, np.inf)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        dx, dy = x1 - x0, y1 - y0
+        t = np.clip(((u - x0) * dx + (v - y0) * dy) / (dx * dx + dy * dy), 0, 1)
+        least = np.minimum(least, np.hypot(u - x0 - t * dx, v - y0 - t * dy))
+        crosses = (y0 > v) != (y1 > v)
+        inside ^= crosses & (u < x0 + (v - y0) * dx / (dy if dy else 1.0))
+    return np.where(inside, least, -least)
+
+
+def _with_digit(part: dict[str, Any], rng: np.random.Generator) -> list[dict[str, Any]]:
+    """The part, or a number of bars within a square that the design says to ignore."""
+    if part.get("use") != "ignore":
+        return [part]
+    (x, y), size = part["at"], 0.7 * part["size"]
+    turn = part.get("turn_deg", 0.0)
+    bars = [(0.0, 0.5, 0.0, 0.6), (0.3, 0.0, 90.0, 1.0), (-0.3, 0.2, 90.0, 0.6), (0.0, 0.0, 0.0, 0.6)]
+    kept = [bars[i] for i in range(4) if i < 2 or rng.random() < 0.5]
+    return [
+        {"shape": "bar", "size": size * long, "line_width": 0.12, "turn_deg": turn + angle,
+         "at": (x + _turn(size * a, size * b, -turn)[0], y + _turn(size * a, size * b, -turn)[1])}
+        for a, b, angle, long in kept
+    ]  # fmt: skip
 
 
 @dataclass
@@ -155,18 +202,61 @@ def camera(kind: str, rng: np.random.Generator) -> Camera:
         }
         places, seats = _corners(106.0), {"a": (2.4, 0.03)}
         kinds = dict.fromkeys("1234", "a")
+    elif kind in SHAPES:
+        marks, places, seats, kinds = _of_any_shape(kind, half)
     else:
         squares = [{"shape": "square", "size": 0.9, "at": at} for at in ((0.46, 0.46), (-0.46, -0.46))]
         marks = {"c": {"polarity": "bright", "parts": squares, "margin": 0.5}}
         places, seats = _middles(half + 3.0), {"c": (2.8, 0.02)}
         kinds = dict.fromkeys("5678", "c")
-    inward = kind in ("notches", "round", "wedges")
+    inward = kind in ("notches", "round", "wedges", "arrows", "halves")
     points = []
     for name, (x, y) in places.items():
         dx, dy = rng.normal(0, 0.006, 2)
         point = {"id": name, "x": x + dx, "y": y + dy, "sigma": 0.002, "mark": kinds.get(name, "x")}
         points.append(point | ({"turn_deg": _INWARD[name]} if inward else {}))
     return Camera(marks, points, half, seats)
+
+
+def _of_any_shape(kind: str, half: float) -> Any:
+    """Marks, places, plates and kinds of marks of a camera of :data:`SHAPES`."""
+    cross = {"shape": "cross", "size": 2.4, "line_width": 0.14}
+    part: list[dict[str, Any]]
+    places, polarity, margin, seat = _corners(106.0), "bright", 0.5, (2.8, 0.02)
+    if kind == "bars":
+        part = [{"shape": "bar", "size": 1.6, "line_width": 0.3, "at": (0.0, at)} for at in (-0.5, 0.5)]
+    elif kind == "brackets":
+        part = [{**cross, "arms_deg": (0.0, 90.0)}]
+    elif kind == "three":
+        part = [{**cross, "arms_deg": (90.0, 210.0, 330.0)}]
+    elif kind == "tees":
+        part, places = [{**cross, "arms_deg": (0.0, 90.0, 180.0)}], _middles(108.0)
+    elif kind == "floating":
+        part, polarity, seat = [{**cross, "size": 3.0, "gap": 1.2}], "dark", (2.6, 0.85)
+    elif kind == "arrows":
+        part = [
+            {"shape": "wedge", "size": 1.0, "width": 0.9},
+            {"shape": "bar", "size": 1.4, "line_width": 0.25, "at": (0.0, -1.6), "turn_deg": 90.0},
+        ]
+        places, seat = _middles(half + 4.0), (4.6, 0.02)
+    elif kind == "polygons":
+        kite = [(0.0, 0.0), (0.7, 0.9), (0.2, 0.7), (0.2, 1.6), (-0.2, 1.6), (-0.2, 0.7), (-0.7, 0.9)]
+        part, seat = [{"shape": "polygon", "corners": [(x, y - 0.8) for x, y in kite]}], (2.8, 0.02)
+    elif kind == "numbers":
+        part = [
+            {**cross, "gap": 0.4},
+            {"shape": "disk", "size": 0.16},
+            {"shape": "square", "size": 0.9, "at": (0.75, 0.75), "use": "ignore"},
+        ]
+        margin = 0.6
+    elif kind == "halves":
+        part = [{"shape": "arc", "size": 2.0, "from_deg": 0.0, "to_deg": 180.0}]
+        places = _middles(half + 4.0)
+    else:
+        part = [{"shape": "arc", "size": 2.0, "from_deg": a, "to_deg": a + 90.0} for a in (0.0, 180.0)]
+        part.append({"shape": "disk", "size": 0.4, "use": "cut"})
+    mark = {"polarity": polarity, "parts": part, "margin": margin}
+    return {"s": mark}, places, {"s": seat}, dict.fromkeys(places, "s")
 
 
 @dataclass
@@ -216,12 +306,20 @@ def camera_of(design: dict[str, Any], rng: np.random.Generator) -> Camera:
 
 
 def photograph(
-    kind: str, seed: int, px_per_mm: float | None = None, design: dict[str, Any] | None = None
+    kind: str,
+    seed: int,
+    px_per_mm: float | None = None,
+    design: dict[str, Any] | None = None,
+    frame: int | None = None,
 ) -> Photograph:
-    """A photograph of a kind of camera, or of that with a design."""
-    rng = np.random.default_rng([KINDS.index(kind) if design is None else len(KINDS), seed])
+    """A photograph of a kind of camera, or of that with a design; of a block by one camera a `frame`."""
+    which = [KINDS.index(kind) if design is None else len(OLDER), seed]
+    rng = np.random.default_rng(which)
     cam = camera(kind, rng) if design is None else camera_of(design, rng)
     k = float(px_per_mm or rng.uniform(11, 20))
+    if frame is not None:
+        rng = np.random.default_rng([*which, frame])
+    negative = kind in SHAPES and bool(rng.random() < 0.3)
     size = round(2 * 124.0 * k)
     texture = _picture(rng, 2048)
     fine = rng.standard_normal((512, 512)).astype(np.float32)
@@ -237,10 +335,12 @@ def photograph(
     back = np.linalg.inv(linear)
     border = float(rng.uniform(0.01, 0.04))
     stray = rng.normal(0, 1, 3) * [0.02, 0.0002, 0.0002]  # of the light of the scanner
+    lines = rng if frame is None else np.random.default_rng([*which, 0, 0])  # of the camera
     real = {
         name: [
-            part | {key: part[key] * float(1 + rng.normal(0, 0.04)) for key in ("line_width",) if key in part}
-            for part in mark["parts"]
+            part | {key: part[key] * float(1 + lines.normal(0, 0.04)) for key in {"line_width"} & part.keys()}
+            for whole in mark["parts"]
+            for part in _with_digit(whole, lines)
         ]
         for name, mark in cam.marks.items()
     }
@@ -267,7 +367,9 @@ def photograph(
             tu2, tv2 = _turn(u, v, point.get("turn_deg", 0.0))
             share = np.zeros_like(u)
             for part in real[point["mark"]]:
-                share = np.maximum(share, drawn_part(part, tu2, tv2, step))
+                drawn = drawn_part(part, tu2, tv2, step)
+                cut = part.get("use") == "cut"
+                share = share * (1 - drawn) if cut else np.maximum(share, drawn)
             tone_of = border if mark["polarity"] == "dark" else bright
             light[near] = here + share * (tone_of - here)
         return light
@@ -306,6 +408,8 @@ def photograph(
     grey = light**gamma + amount * grain * np.sqrt(np.clip(light, 0.01, 1)) * 1.4
     grey += float(rng.uniform(0.002, 0.006)) * rng.standard_normal((size, size)).astype(np.float32)
     grey = (20 + 200 * grey).astype(np.float32)
+    if negative:
+        grey = 240 - grey
     _dirt(grey, rng)
     depth16 = bool(rng.random() < 0.3)
     jpeg = None if depth16 or rng.random() < 0.6 else int(rng.integers(60, 96))
@@ -328,6 +432,7 @@ def photograph(
         "rotation_deg": turn,
         "mirrored": mirrored,
         "px_per_mm": k,
+        "negative": negative,
         "blur": [form, blur],
         "jpeg": jpeg,
     }

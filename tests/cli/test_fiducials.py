@@ -72,6 +72,28 @@ def test_an_oriented_scan_is_exported_to_micmac_and_metashape(files, tmp_path: P
     assert "--micmac" in err
 
 
+def test_marks_are_learnt_from_a_scan_and_a_block_is_oriented(files, tmp_path: Path, reseau: Run) -> None:
+    photo, _ = files
+    table, own, block = tmp_path / "report.csv", tmp_path / "own.json", tmp_path / "block"
+    rows = "".join(f"{name},{x},{y}\n" for name, (x, y) in UNEVEN.items())
+    table.write_text("id,x,y\n" + rows)
+    x, y = np.rint(photograph(UNEVEN, rotation=90)[1][0])
+    status, out, _ = reseau(
+        "design", "fiducials", table, "--learn", photo, "--mark-at", f"1={x:g},{y:g}", "--mark-px", 46,
+        "-o", own, "--overlay", tmp_path / "learnt.png",
+    )  # fmt: skip
+    assert status == 0
+    assert "photo.tif: 4 of 4 marks, rotated by 90°" in out
+    block.mkdir()
+    write_image(block / "negative.tif", 255 - photograph(UNEVEN, seed=3)[0])
+    write_image(block / "other.tif", photograph(UNEVEN, without=tuple(UNEVEN))[0])
+    status, out, err = reseau("measure", "fiducials", block, photo, "-d", own, "-o", tmp_path / "oriented")
+    assert (status, out.splitlines()[-1]) == (1, "2 of 3 photographs oriented")
+    assert "negative.tif: 4 of 4 fiducial marks, rotated by 0°, negative" in out
+    assert "other.tif" in err
+    assert {path.name for path in (tmp_path / "oriented").iterdir()} == {"negative.json", "photo.json"}
+
+
 @pytest.mark.slow
 def test_a_camera_is_known_by_its_name_and_written_to_be_edited(files, tmp_path: Path, reseau: Run) -> None:
     status, out, _ = reseau("design", "fiducials")

@@ -10,8 +10,9 @@ from reseau.core.data import ImagePoints
 from reseau.core.failure import Code, Failure
 from reseau.io import FiducialDesign, FiducialMark, FiducialOrientation, MarkPart
 from reseau.io.scans import scan_of
-from reseau.measure.fiducials import measure_fiducials
+from reseau.measure.fiducials import learn_marks, measure_fiducials
 from reseau.measure.fiducials.forms import contours_of
+from reseau.measure.fiducials.learning import LearntDesign
 from reseau.measure.fiducials.measure import FiducialOptions
 from reseau.measure.fiducials.result import FiducialResult
 from reseau.optics.formation import Outline, draw, mark_outline
@@ -31,6 +32,15 @@ def area(contours) -> float:
     )
 
 
+def learnt(image, design: FiducialDesign, place, mark_px: float, name: str) -> LearntDesign:
+    found = learn_marks(scan_of(image), design, {name: tuple(np.rint(place))}, mark_px)
+    assert not isinstance(found, Failure), found
+    return found
+
+
+_SQUARE = MarkPart(shape="square", size=1.0)
+
+
 @pytest.mark.parametrize(
     ("parts", "expected"),
     [
@@ -45,6 +55,18 @@ def area(contours) -> float:
             (MarkPart(shape="cross", size=2.0, line_width=0.2), MarkPart(shape="disk", size=1.0)),
             0.4 + np.pi / 4,
         ),
+        ((MarkPart(shape="polygon", corners=((0, 0), (0, 1), (2, 1), (2, 0))),), 2.0),
+        ((MarkPart(shape="arc", size=2.0, from_deg=0, to_deg=180),), np.pi / 2),
+        ((MarkPart(shape="cross", size=2.0, line_width=0.2, arms_deg=(0, 90)),), 0.4),
+        ((MarkPart(shape="cross", size=2.0, line_width=0.2, arms_deg=(0, 90, 180)),), 0.58),
+        # Parts that touch along a side, lie on each other, or are taken away.
+        (
+            (MarkPart(shape="square", size=1.0), MarkPart(shape="bar", size=1.0, line_width=1.0, at=(1, 0))),
+            2.0,
+        ),
+        ((_SQUARE, _SQUARE), 1.0),
+        ((MarkPart(shape="disk", size=2.0), MarkPart(shape="square", size=1.0, use="cut")), np.pi - 1),
+        ((MarkPart(shape="disk", size=2.0), MarkPart(shape="square", size=1.0, use="ignore")), np.pi),
     ],
 )
 def test_a_mark_covers_the_area_of_the_union_of_its_parts(parts, expected) -> None:
@@ -61,6 +83,56 @@ def test_marks_are_measured_within_their_sigmas() -> None:
     sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
     assert np.abs(error).max() < 0.05  # px
     assert np.abs(error / sigma).max() < 4.0
+
+
+def test_negatives_are_found() -> None:
+    image, places = photograph(UNEVEN)
+    found = measured(255 - image, camera(UNEVEN))
+    assert found.negative
+    assert np.abs(found.xy - places).max() < 0.05  # px
+
+
+def test_marks_are_learnt_from_one_scan_and_measured_in_another_within_their_sigmas() -> None:
+    example, places = photograph(UNEVEN, rotation=90, seed=1)
+    taken = learnt(example, camera(UNEVEN), places[1], 46.0, "2")
+    assert taken.folds == {"x": 4}
+    assert (taken.pattern.attitude.rotation, taken.pattern.attitude.mirrored) == (90, False)
+    image, places = photograph(UNEVEN, mirrored=True)
+    found = measured(image, FiducialDesign.parse(taken.design.to_json(), where=""))
+    assert found.attitude.mirrored
+    error, sigma = found.xy - places, np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
+    assert np.abs(error).max() < 0.05  # px
+    assert np.abs(error / sigma).max() < 4.0
+    shared = found.covariance.diagonal() / found.fit.covariance.diagonal()
+    assert (shared > 2.0).tolist() == 2 * [False, False, True]  # what all marks have in common is a shift
+
+
+def test_the_place_that_was_given_is_the_point_of_an_asymmetric_mark() -> None:
+    example, places = photograph(UNEVEN, without=tuple(PLACES))
+    for x, y in np.rint(places).astype(int):
+        example[y - 8 : y + 9, x - 1 : x + 2] = example[y + 6 : y + 9, x - 1 : x + 8] = 180
+    found = learnt(example, camera(UNEVEN), places[0], 36.0, "1")
+    assert found.folds == {"x": 1}
+    mark = found.design.marks["x"].learnt
+    assert mark is not None
+    assert mark.covariance[0] == pytest.approx(1 / 12)  # of a pixel
+
+
+def test_one_place_in_a_square_of_marks_leaves_a_mirrored_film_possible() -> None:
+    square = {"1": (20.0, -20.0), "2": (-20.0, -20.0), "3": (-20.0, 20.0), "4": (20.0, 20.0)}
+    image, places = photograph(square)
+    assert len(learnt(image, camera(square), places[0], 46.0, "1").others) == 1
+    every = {name: tuple(place) for name, place in zip("123", np.rint(places), strict=False)}
+    found = learn_marks(scan_of(image), camera(square), every, 46.0)
+    assert not isinstance(found, Failure)
+    assert found.others == ()
+
+
+def test_what_does_not_recur_is_not_learnt() -> None:
+    image, places = photograph(UNEVEN, without=("1", "3"))
+    found = learn_marks(scan_of(image), camera(UNEVEN), {"2": tuple(np.rint(places[1]))}, 46.0)
+    assert isinstance(found, Failure)
+    assert found.code is Code.NOT_FOUND
 
 
 @pytest.mark.slow

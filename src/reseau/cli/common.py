@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from ..core import vocabulary as v
+from ..core.data import twice
 from ..core.errors import EstimationError, UsageError
 from ..core.files import made_folder, writable
 from ..core.notice import before_compiling
@@ -205,6 +206,30 @@ def overlay_files(path: Path, images: Sequence[Path]) -> dict[Path, Path]:
         if file.resolve() in {image.resolve() for image in images}:
             raise UsageError("would replace the image", where=file, do="choose another name")
     return dict(zip(shown, files, strict=True))
+
+
+def out_files(path: Path | None, images: Sequence[Path], one: bool) -> dict[Path, Path]:
+    """Return the file of each image: the one that is named for `one`, or one for each in a folder.
+
+    Raises
+    ------
+    UsageError
+        If a file is named for several images, or two images have one name.
+    InputError
+        If the folder cannot be created.
+    """
+    if path is None:
+        return {}
+    if one:
+        writable(path, ".json", ".csv")
+        return {images[0]: path}
+    if path.suffix:
+        raise UsageError("must be a folder for several images", where="--out")
+    if (again := twice([image.stem for image in images])) is not None:
+        raise UsageError(
+            f"two images are called {again!r}", where="--out", do="give them one after the other"
+        )
+    return {image: made_folder(path) / f"{image.stem}.json" for image in images}
 
 
 def probability(p: float) -> str:

@@ -12,12 +12,12 @@ import typer
 from ..core import vocabulary as v
 from ..core.files import writable
 from ..core.options import Option
-from .common import say, say_notes
+from .common import overlay_files, progress, required, say, say_notes
 from .declared import Commands
 
 if TYPE_CHECKING:
     from ..designs.drawing import Drawable
-    from ..io import BoardDesign, ReseauDesign, TestfieldDesign
+    from ..io import BoardDesign, FiducialDesign, ReseauDesign, TestfieldDesign
 
 
 app = Commands(help="Draw a target for printing in true size, and write its coordinates.")
@@ -118,28 +118,89 @@ def n_wires(
 
 @app.command()
 def fiducials(
-    name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="Name of a camera; by default all are listed.")
+    camera: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="CAMERA",
+            help="Name of a camera, a fiducial-design/1, or a CSV id,x,y[,sigma][,mark][,turn_deg] of its "
+            "calibrated coordinates (mm) with --learn; by default the names of cameras are listed.",
+        ),
     ] = None,
     out: Annotated[v.Out | None, "Here the design, JSON; - for standard output."] = None,
+    learn: Annotated[Path | None, Option("Scan from which marks are learnt, each kind from one.")] = None,
+    mark_at: Annotated[
+        list[str] | None,
+        Option("Mark that is learnt, and its place in the scan (px); repeatable.", value="ID=X,Y"),
+    ] = None,
+    mark_px: Annotated[v.MarkPx | None, "Here the diameter with even surroundings."] = None,
+    overlay: v.Overlay | None = None,
 ) -> None:
-    """Write the fiducial marks of an aerial camera that is known by name, to be edited to its report."""
+    """Write the fiducial marks of an aerial camera, to be edited to its report, or learnt from a scan."""
     from ..core.errors import UsageError
     from ..designs import aerial_camera, aerial_cameras
+    from ..io import FiducialDesign
 
-    if name is None:
+    if camera is None:
         if out is not None:
             raise UsageError("needs the NAME of a camera", where="--out", do="without --out all are listed")
         for each, design in aerial_cameras().items():
             say(f"{each:18} {design.name}\n")
         return
-    design = aerial_camera(name)
+    path = Path(camera)
+    if learn is None and (mark_at or mark_px or overlay):
+        raise UsageError("is needed by --mark-at, --mark-px and --overlay", where="--learn")
+    if path.suffix.lower() == ".csv":
+        if learn is None:
+            raise UsageError("a table has no marks", where=camera, do="give --learn and --mark-at")
+        design = FiducialDesign.read_csv(path, [place.partition("=")[0] for place in mark_at or []])
+    else:
+        design = FiducialDesign.read(path) if path.suffix else aerial_camera(camera)
+    if learn is not None:
+        design = _learnt(design, learn, mark_at or [], mark_px, overlay, every=path.suffix.lower() == ".csv")
     if out is None or str(out) == "-":
         say(design.to_json())
     else:
         writable(out, ".json")
         design.write(out)
-        say(f"{out}: {design.name}, {len(design.points)} marks; {design.source}\n")
+        source = "" if design.source is None else f"; {design.source}"
+        say(f"{out}: {design.name}, {len(design.points)} marks{source}\n")
+
+
+def _learnt(
+    design: FiducialDesign,
+    scan: Path,
+    at: list[str],
+    mark_px: float | None,
+    overlay: Path | None,
+    every: bool,
+) -> FiducialDesign:
+    """The design with marks from a scan."""
+    from ..core.errors import UsageError
+    from ..io.images import open_scan
+    from ..measure.fiducials import learn_marks
+
+    if not at or mark_px is None:
+        raise UsageError("needs --mark-at and --mark-px", where="--learn")
+    places = {}
+    for place in at:
+        name, _, xy = place.partition("=")
+        try:
+            x, y = map(float, xy.split(","))
+        except ValueError:
+            raise UsageError(f"is {place!r}, not ID=X,Y", where="--mark-at") from None
+        places[name] = (x, y)
+    drawn = None if overlay is None else overlay_files(overlay, [scan])[scan]
+    opened = open_scan(scan)
+    with progress(f"learning marks from {scan.name}", 1):
+        found = required(learn_marks(opened, design, places, mark_px), scan)
+    kinds = {point.mark for point in design.points}
+    if every and (rest := sorted(kinds - set(found.folds))):
+        raise UsageError(f"no mark of the kind {', '.join(rest)} is given", where="--mark-at")
+    if drawn is not None:
+        found.overlay(opened.picture(), drawn)
+    for line in found.lines():
+        say(f"{scan.name}: {line}\n")
+    return found.design
 
 
 @app.command("testfield")

@@ -67,9 +67,7 @@ def reseau(
     design: v.Design,
     reading: Reading,
     output: Output,
-    mark_px: Annotated[
-        float | None, Option("Size of a mark (px); for a grid, the width of its lines.")
-    ] = None,
+    mark_px: Annotated[v.MarkPx | None, "For a grid, the width of its lines."] = None,
     mirrored: Annotated[v.Mirrored | None, BY_DESIGN] = None,
     max_rotation_deg: Annotated[v.MaxRotationDeg | None, NOT_NOMINAL] = None,
     row_jitter_px: v.RowJitterPx = 0.0,

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from ..core import vocabulary as v
-from ..core.errors import InputError
+from ..core.errors import InputError, ReseauError
 from ..core.options import Group, Option
-from .common import Computing, overlay_files, progress, required, say, say_files_left_out, say_json
+from .common import Computing, out_files, overlay_files, progress, required, say, say_files_left_out, say_json
 from .measure import Output
 
 if TYPE_CHECKING:
@@ -127,7 +128,10 @@ def _line(document: FrameOrientation) -> str:
 
 
 def fiducials(
-    scan: Annotated[Path, typer.Argument(help="Scanned photograph with its borders: TIFF, PNG, JPEG.")],
+    images: Annotated[
+        list[Path],
+        typer.Argument(help="Scanned photographs with their borders, or folders of them: TIFF, PNG, JPEG."),
+    ],
     design: Annotated[
         v.Design,
         "Here the fiducial marks of the camera, fiducial-design/1, or the name of a camera that "
@@ -146,11 +150,12 @@ def fiducials(
     mirrored: Annotated[
         v.Mirrored | None, "Default: determined by the marks if they are not symmetric."
     ] = None,
-) -> None:
-    """Measure the fiducial marks of a scanned aerial photograph, and orient it.
+    negative: Annotated[v.Negative | None, "Default: determined by the marks."] = None,
+) -> int:
+    """Measure the fiducial marks of scanned aerial photographs, and orient them.
 
-    The JSON document is the calibration of the scan for `reseau apply`, which also resamples the picture to
-    millimetres of the camera.
+    The JSON document of a scan is its calibration for `reseau apply`, which also resamples the picture to
+    millimetres of the camera. Of several scans --out and --overlay are folders.
     """
     from ..core.failure import Failure
     from ..core.provenance import sha256_of
@@ -159,21 +164,42 @@ def fiducials(
     from ..io.images import open_scan, read_image
     from ..measure.fiducials import measure_fiducials
     from ..measure.fiducials.measure import FiducialOptions
+    from ..procedures.exposures import photographs_named
 
-    drawn = output.drawn(scan)
+    one = len(images) == 1 and not images[0].is_dir()
+    images = photographs_named(images)
+    drawn = {} if output.overlay is None else overlay_files(output.overlay, images)
+    outs = out_files(output.out, images, one)
     named = design.parent == Path() and not design.suffix and not design.exists()
     camera = aerial_camera(design.name) if named else FiducialDesign.read(design)
-    options = FiducialOptions(dpi, None if rotation is None else int(rotation), mirrored, transform)
-    opened = open_scan(scan)
-    with progress(f"measuring {scan.name}", 1):
-        found = measure_fiducials(opened, camera, options, sha256_of(scan))
-    if drawn is not None and isinstance(found, Failure):
-        found.overlay(read_image(scan), drawn)
-    elif drawn is not None:
-        assert not isinstance(found, Failure)
-        pixels = opened.window(0, opened.height, 0, opened.width)
-        found.overlay(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels, drawn)
-    output.deliver(required(found, scan).document(), csv_of, _marks)
+    turn = None if rotation is None else int(rotation)
+    options = FiducialOptions(dpi, turn, mirrored, negative, transform)
+    documents = []
+    with progress("measuring fiducial marks", len(images)) as step:
+        for image in images:
+            try:
+                opened = open_scan(image)
+                found = measure_fiducials(opened, camera, options, sha256_of(image))
+                if image in drawn and not isinstance(found, Failure):
+                    found.overlay(opened.picture(), drawn[image])
+                elif image in drawn:
+                    found.overlay(read_image(image), drawn[image])
+                document = required(found, image).document()
+            except ReseauError as error:
+                if one:
+                    raise
+                typer.echo(f"reseau: {error}", err=True)
+                continue
+            finally:
+                step()
+            documents.append(document)
+            each = replace(output, out=outs.get(image), as_json=one and output.as_json)
+            each.deliver(document, csv_of, _marks if one or not output.as_json else lambda _: "")
+    if not one and output.as_json:
+        say_json([document.to_dict() for document in documents])
+    elif not one:
+        say(f"{len(documents)} of {len(images)} photographs oriented\n")
+    return 0 if len(documents) == len(images) else 1
 
 
 def csv_of(document: FiducialOrientation) -> str:
@@ -193,7 +219,8 @@ def _marks(document: FiducialOrientation) -> str:
     side = "mirrored, " if document.mirrored else ""
     lines = [
         f"{document.image}: {good} of {len(document.marks)} fiducial marks, {side}rotated by "
-        f"{document.rotation_deg}°, {25.4 * document.px_per_mm:.1f} dpi"
+        f"{document.rotation_deg}°, {'negative, ' if document.negative else ''}"
+        f"{25.4 * document.px_per_mm:.1f} dpi"
     ]
     sigma, kind = document.transform.sigma_mm, document.transform.kind
     if sigma is None:
@@ -262,8 +289,7 @@ def perforations(
     rows = [np.array([*box, perforation_px]) for box in (left, right)]
     plane = required(film_plane(opened, rows, number, channel=opened.channels.index(name), reach=reach), scan)
     if drawn is not None:
-        pixels = opened.window(0, opened.height, 0, opened.width)
-        plane.overlay(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels, drawn)
+        plane.overlay(opened.picture(), drawn)
     found = film_scale(plane)
     if as_json:
         document: dict[str, Any] = {

@@ -54,6 +54,10 @@ Mirrored = Annotated[
     bool,
     Option("The image shows the target from behind, or in a mirror.", Group.TARGET, off="--not-mirrored"),
 ]
+Negative = Annotated[
+    bool,
+    Option("The scan shows bright marks dark, and dark ones bright.", Group.TARGET, off="--positive"),
+]
 MaxRotationDeg = Annotated[
     float,
     Option("Largest rotation of the target in the image (degrees).", Group.TARGET, least=0, most=180),
@@ -70,6 +74,7 @@ Fill = Annotated[
 PsfPx = Annotated[
     float, Option("Width of the point-spread function (px, one sigma).", Group.CAMERA, least=0.1)
 ]
+MarkPx = Annotated[float, Option("Size of a mark (px).")]
 SearchPx = Annotated[float, Option("Largest distance from the predicted position (px).", least=1)]
 Region = Annotated[
     tuple[int, int, int, int],

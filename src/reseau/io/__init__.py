@@ -12,6 +12,7 @@ from .fiducials import (
     FiducialMark,
     FiducialOrientation,
     FiducialPoint,
+    LearntMark,
     MarkPart,
     MeasuredFiducial,
 )
@@ -48,6 +49,7 @@ __all__ = [
     "FrameCorners",
     "FrameOrientation",
     "FrameTransform",
+    "LearntMark",
     "LensDocument",
     "LensSensor",
     "Mark",

@@ -71,6 +71,11 @@ class Scan:
     curve: ToneCurve | None = None
     filters: str = ""
 
+    def picture(self) -> NDArray[Any]:
+        """All pixels: grey values (h, w), or those of the channels (h, w, c)."""
+        pixels = self.window(0, self.height, 0, self.width)
+        return np.asarray(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels)
+
     def overview(self, longest: int) -> tuple[NDArray[np.float32], float]:
         """Reduce the image so that its longer side has at most `longest` pixels.
 

@@ -1,5 +1,6 @@
-"""Fiducial marks of scanned aerial photographs: found by shape and pattern, measured with covariance."""
+"""Fiducial marks of scanned photographs: found by shape and pattern, learnt, measured with covariance."""
 
+from .learning import learn_marks
 from .measure import measure_fiducials
 
-__all__ = ["measure_fiducials"]
+__all__ = ["learn_marks", "measure_fiducials"]

@@ -1,7 +1,7 @@
-"""Fiducial marks as outlines: unions of crosses, disks, rings, arcs, wedges and notches.
+"""Fiducial marks as outlines: of parts that are united or cut, each one or more polygons.
 
-A part of a mark is one or more polygons (curves have short sides and the area of the curve); the boundary of
-the union is what of each part's boundary lies outside the other parts. Its corners move with the parameters
+Curves have short sides and the area of the curve. The boundary of a mark is every side of its parts that has
+the mark on one side and not on the other. Its corners move with the parameters
 of the form, which describe what the report of a camera does not state: the size, a small rotation, and the
 spread of edges by which film and development make a line wider or narrower.
 """
@@ -17,42 +17,54 @@ import numpy as np
 from ...core.data import Array, Mask, Rows
 from ...io import FiducialMark, MarkPart
 from ...optics.formation import Outline, coverage, coverage_derivatives, side_rule
-from ..matching.shapes import Window
+from ..matching.shapes import Shape, Window
+from .learnt import LearntShape, thickness_of
 
 _SIDES = 72
 """Sides of the polygon of a circle."""
 _SAME = 1e-9
+_BESIDE = 1e-7
+"""Distance from a side at which it is asked what lies left and right of it, in units of its length."""
 
 
 def margin_of(mark: FiducialMark) -> float:
     """Width around a mark in which its background is even, mm."""
+    if mark.learnt is not None:
+        return 0.0
     return mark.margin if mark.margin is not None else 0.3 * 2 * reach_of(mark)
 
 
 def reach_of(mark: FiducialMark) -> float:
     """Largest distance of a mark's outline from its point, mm; of a notch, its tooth."""
-    return max(float(np.hypot(*part.at)) + _half(part) for part in mark.parts)
-
-
-def boldest_of(mark: FiducialMark) -> float:
-    """Width of the boldest part of a mark, mm: of its lines, or its size."""
-    return max(part.line_width or part.size for part in mark.parts)
-
-
-def _half(part: MarkPart) -> float:
-    if part.shape == "wedge":
-        return float(np.hypot(part.size, (part.width or 0.0) / 2))
-    if part.shape == "notch":
-        width = part.width or 0.0
-        return width / 2 if part.form == "round" else float(np.hypot(part.size, width / 2))
-    return part.size / np.sqrt(2) if part.shape == "square" else part.size / 2
+    if mark.learnt is not None:
+        return mark.learnt.reach / mark.learnt.px_per_mm
+    parts = [part for part in mark.parts if part.use == "mark"]
+    return max(float(np.hypot(*corners.T).max()) for part in parts for corners in _polygons(part, None))
 
 
 @lru_cache(maxsize=256)
-def contours_of(mark: FiducialMark, beyond: float) -> list[Array]:
-    """Closed polygons (m, 2) of the union of a mark's parts, interior on the left, y up, in mm.
+def thicknesses(mark: FiducialMark) -> tuple[float, float]:
+    """Widths of the thinnest and of the boldest part of a mark, mm: of its lines, or its size."""
+    if mark.learnt is not None:
+        thickness = thickness_of(mark.learnt)
+        return thickness, thickness
+    each = [
+        part.line_width
+        or part.width
+        or 4 * abs(_area(corners)) / np.hypot(*np.ptp(_sides(corners), 1).T).sum()
+        for part in mark.parts
+        if part.use == "mark"
+        for corners in _polygons(part, None)[:1]
+    ]
+    return float(min(each)), float(max(each))
 
-    The border of a notch extends to twice `beyond`, half the side of a window around it.
+
+@lru_cache(maxsize=256)
+def contours_of(mark: FiducialMark, beyond: float, ignored: bool = False) -> list[Array]:
+    """Closed polygons (m, 2) of a mark, interior on the left, y up, in mm.
+
+    The border of a notch extends to twice `beyond`, half the side of a window around it. With `ignored`, the
+    outline of what is not used around the mark.
 
     Examples
     --------
@@ -63,27 +75,36 @@ def contours_of(mark: FiducialMark, beyond: float) -> list[Array]:
     >>> len(contours_of(FiducialMark(polarity="dark", parts=(cross, ring)), 3.0))
     5
     """
-    parts = [_polygons(part, beyond) for part in mark.parts]
+    used = [part for part in mark.parts if (part.use == "ignore") == ignored]
+    parts = [(part.use == "cut", _polygons(part, beyond)) for part in used]
     if len(parts) == 1:
-        return parts[0]
-    kept = []
-    for k, part in enumerate(parts):
-        rest = [other for j, other in enumerate(parts) if j != k]
-        sides = np.concatenate([_sides(polygon) for polygon in part])
-        sides = _divided(sides, np.concatenate([_sides(polygon) for other in rest for polygon in other]))
-        middle = sides.mean(axis=1)
-        outside = np.ones(len(sides), dtype=bool)
-        for other in rest:
-            outside &= ~_inside(middle, other)
-        kept.append(sides[outside])
-    return _chained(np.concatenate(kept))
+        return parts[0][1]
+    every = np.concatenate([_sides(polygon) for _, polygons in parts for polygon in polygons])
+    sides = _divided(every)
+    middle, along = sides.mean(axis=1), sides[:, 1] - sides[:, 0]
+    beside = _BESIDE * np.stack([-along[:, 1], along[:, 0]], axis=1)
+    left, right = (_covered(middle + step, parts) for step in (beside, -beside))
+    kept = np.where((left & ~right)[:, None, None], sides, sides[:, ::-1])[left != right]
+    # Parts that touch have sides in common.
+    _, once = np.unique(np.rint(kept.mean(axis=1) / _SAME / 10), axis=0, return_index=True)
+    return _chained(kept[np.sort(once)])
 
 
-def _polygons(part: MarkPart, beyond: float) -> list[Array]:
-    """Polygons of one part; a hole runs in the opposite direction."""
-    line, half = part.line_width or 0.0, part.size / 2
+def _covered(points: Array, parts: list[tuple[bool, list[Array]]]) -> Mask:
+    """Points that lie in the mark: a cut takes away from what is before it."""
+    inside = np.zeros(len(points), dtype=bool)
+    for cut, polygons in parts:
+        inside = np.where(_inside(points, polygons), not cut, inside)
+    return inside
+
+
+def _polygons(part: MarkPart, beyond: float | None) -> list[Array]:
+    """Polygons of one part; a hole runs in the opposite direction. Without `beyond`, of a notch its tooth."""
+    line, half, w = part.line_width or 0.0, (part.size or 0.0) / 2, (part.width or 0.0) / 2
     if part.shape == "cross":
-        found = _cross(half, line / 2, (part.gap or 0.0) / 2)
+        found = _cross(half, line / 2, (part.gap or 0.0) / 2, part.arms_deg or (0.0, 90.0, 180.0, 270.0))
+    elif part.shape == "bar":
+        found = [np.array([[-half, -line / 2], [half, -line / 2], [half, line / 2], [-half, line / 2]])]
     elif part.shape == "disk":
         found = [_circle(half)]
     elif part.shape == "square":
@@ -92,16 +113,19 @@ def _polygons(part: MarkPart, beyond: float) -> list[Array]:
         found = [_circle(half), _circle(half - line)[::-1]]
     elif part.shape == "arc":
         start, stop = np.deg2rad([part.from_deg or 0.0, part.to_deg or 0.0])
-        found = [np.concatenate([_bow(half, start, stop), _bow(half - line, start, stop)[::-1]])]
+        inner = _bow(half - line, start, stop)[::-1] if line else np.zeros((1, 2))
+        found = [np.concatenate([_bow(half, start, stop), inner])]
+    elif part.shape == "polygon":
+        corners = np.array(part.corners, dtype=np.float64)
+        found = [corners if _area(corners) > 0 else corners[::-1]]
     elif part.shape == "wedge":
-        w = (part.width or 0.0) / 2
-        found = [np.array([[0, 0], [-w, -part.size], [w, -part.size]])]
+        found = [np.array([[0, 0], [-w, -2 * half], [w, -2 * half]])]
     else:
-        w = (part.width or 0.0) / 2
-        edge = 0.0 if part.form == "round" else -part.size
-        tooth = _bow(w, 0.0, np.pi) if part.form == "round" else np.array([[w, edge], [0, 0], [-w, edge]])
-        b = 2 * beyond + part.size
-        found = [np.concatenate([[[-b, edge - b], [b, edge - b], [b, edge]], tooth, [[-b, edge]]])]
+        edge = 0.0 if part.form == "round" else -2 * half
+        found = [_bow(w, 0.0, np.pi) if part.form == "round" else np.array([[w, edge], [0, 0], [-w, edge]])]
+        if beyond is not None:
+            b = 2 * beyond + 2 * half
+            found = [np.concatenate([[[-b, edge - b], [b, edge - b], [b, edge]], found[0], [[-b, edge]]])]
     c, s = np.cos(np.deg2rad(part.turn_deg)), np.sin(np.deg2rad(part.turn_deg))
     return [polygon @ np.array([[c, s], [-s, c]]) + part.at for polygon in found]
 
@@ -119,23 +143,32 @@ def _bow(radius: float, start: float, stop: float) -> Array:
     return np.asarray(grown * np.stack([np.cos(angle), np.sin(angle)], axis=1))
 
 
-def _cross(half: float, w: float, gap: float) -> list[Array]:
-    turn = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    if gap <= w:
-        arm = np.array([[half, -w], [half, w], [w, w]])
-        return [np.concatenate([arm @ np.linalg.matrix_power(turn, k) for k in range(4)])]
-    arm = np.array([[gap, -w], [half, -w], [half, w], [gap, w]])
-    return [arm @ np.linalg.matrix_power(turn, k) for k in range(4)]
+def _cross(half: float, w: float, gap: float, arms_deg: tuple[float, ...]) -> list[Array]:
+    """Arms in any directions, joined where neighbouring sides meet, or apart."""
+    turns = np.sort(np.deg2rad(np.array(arms_deg)) % (2 * np.pi))
+    apart = np.diff(turns, append=turns[0] + 2 * np.pi)
+    joined = []
+    for turn, angle in zip(turns, apart, strict=True):
+        c, s = np.cos(turn), np.sin(turn)
+        foot = [[gap, w], [gap, -w]] if gap > w else [[w / np.tan(angle / 2), w]]
+        arm = np.array([[half, -w], [half, w], *foot])
+        joined.append(arm @ np.array([[c, s], [-s, c]]))
+    return joined if gap > w else [np.concatenate(joined)]
+
+
+def _area(polygon: Array) -> float:
+    after = np.roll(polygon, -1, axis=0)
+    return float((polygon[:, 0] * after[:, 1] - polygon[:, 1] * after[:, 0]).sum() / 2)
 
 
 def _sides(polygon: Array) -> Array:
     return np.stack([polygon, np.roll(polygon, -1, axis=0)], axis=1)
 
 
-def _divided(sides: Array, others: Array) -> Array:
-    """Sides (m, 2, 2) divided where other sides cross them."""
+def _divided(sides: Array) -> Array:
+    """Sides (m, 2, 2) divided where others cross them or end on them."""
     pieces = []
-    start, along = others[:, 0], others[:, 1] - others[:, 0]
+    start, along = sides[:, 0], sides[:, 1] - sides[:, 0]
     for a, b in sides:
         d = b - a
         cross = d[0] * along[:, 1] - d[1] * along[:, 0]
@@ -143,8 +176,11 @@ def _divided(sides: Array, others: Array) -> Array:
         rest = start - a
         t = (rest[:, 0] * along[:, 1] - rest[:, 1] * along[:, 0]) / safe
         u = (rest[:, 0] * d[1] - rest[:, 1] * d[0]) / safe
-        inner = (t > _SAME) & (t < 1 - _SAME) & (u >= 0) & (u <= 1)
-        at = np.concatenate([[0.0], np.unique(t[inner]), [1.0]])
+        at = rest @ d / (d @ d)
+        on = np.abs(rest[:, 0] * d[1] - rest[:, 1] * d[0]) < _SAME * (d @ d)
+        cuts = np.concatenate([t[(u >= 0) & (u <= 1)], at[on]])
+        cuts = np.unique(np.rint(cuts[(cuts > _SAME) & (cuts < 1 - _SAME)] / _SAME) * _SAME)
+        at = np.concatenate([[0.0], cuts, [1.0]])
         pieces.append(np.stack([a + at[:-1, None] * d, a + at[1:, None] * d], axis=1))
     return np.concatenate(pieces)
 
@@ -234,6 +270,14 @@ class MovedOutline:
         )
         nodes, tangents = moved
         return Outline(nodes + xy[:, None, :], tangents)
+
+
+def shape_of(mark: FiducialMark, axes: Array, spacing: float, step: Array) -> Shape:
+    """The shape of a mark, by its outline or its image; see :func:`outlined`."""
+    if mark.learnt is not None:
+        return LearntShape(mark.learnt, axes, step[:2])
+    contours = contours_of(mark, reach_of(mark) + margin_of(mark))
+    return outlined([contours], axes[None], spacing, step)
 
 
 def outlined(marks: list[list[Array]], axes: Array, spacing: float, step: Array) -> MovedOutline:

@@ -19,14 +19,22 @@ from ...optics import RationalPolynomial
 from ..film.roll import Kind
 from ..fitting import fit_mapping
 from ..points import Reason
-from .forms import boldest_of, margin_of, reach_of
+from .forms import reach_of
 from .result import FiducialResult
-from .search import Attitude, Pattern, attitudes, find_patterns, formed_mark, least_scales
-from .windows import match_marks, tracked
+from .search import (
+    Attitude,
+    Candidates,
+    Pattern,
+    attitudes,
+    find_patterns,
+    formed_mark,
+    least_scales,
+    overview_size,
+    same_figure,
+    same_places,
+)
+from .windows import fit_of, match_marks, moves_of, tracked
 
-_MARK_PX, _BOLD_PX, _LONGEST = 24.0, 1.0, 3000
-"""Size of the smallest mark with its surroundings, and width of its boldest part, in the overview; largest
-longer side of that."""
 _STATED, _UNKNOWN = 0.03, 0.08
 """Relative uncertainty of the scale that a file states, and of one step of those that are tried."""
 _NO_TAG = (72.0, 96.0)
@@ -43,12 +51,12 @@ _SURE = 0.85
 """Median of these correlations from which no other pattern is examined."""
 _ALIKE_ALL = 0.7
 """Least median of these correlations."""
-_MOST_SIGMA_PX, _MOST_SIGMA_MM = 1.0, 0.03
-"""Largest standard deviation of a coordinate; the larger of the two applies."""
 _FILM_MM = 0.005
 """Irregular deformation of film and scanner between marks, one sigma: the least weight of their distances."""
 _UNLIKE_MM = 0.02
 """Least rms of the residuals of a contradicted transformation, per 100 mm of the pattern's radius."""
+_CERTAIN = float(np.log(1000))
+"""Logarithm of the odds at which images of marks decide between attitudes."""
 _AFFINE = 0.006
 """Largest shear or difference of scales that film and scanners have."""
 _OFF_MM = 0.15
@@ -67,6 +75,8 @@ class FiducialOptions:
         Rotation of the camera's x-axis in the scan, degrees counter-clockwise.
     mirrored : bool, optional
         Whether the scan shows the film from behind.
+    negative : bool, optional
+        Whether the scan shows bright marks of the design dark, and dark ones bright; by default found.
     transform : {"similarity", "affine", "projective", "bilinear"}
         Kind of the transformation to the calibrated coordinates.
     max_tilt_deg : float
@@ -81,6 +91,7 @@ class FiducialOptions:
     dpi: v.Dpi | None = None
     rotation: int | None = None
     mirrored: v.Mirrored | None = None
+    negative: v.Negative | None = None
     transform: v.Transform = "affine"
     max_tilt_deg: float = 8.0
 
@@ -147,7 +158,7 @@ def measure_fiducials(
     if best is None:
         assert failure is not None
         return failure
-    best = _oriented(best, options)
+    best = _oriented(scan, best, options)
     return replace(best, notes=(*best.notes, *notes, *_remarks(best)))
 
 
@@ -216,37 +227,19 @@ def _at_scale(
     scan: Scan, design: FiducialDesign, options: FiducialOptions, scale: float, within: float
 ) -> list[tuple[Pattern, float]]:
     """Patterns at one scale: those of the best attitude, and of others as good."""
-    # Thin lines of large marks would vanish in an overview in which the marks are just large enough.
-    smallest = min(
-        min(2 * (reach_of(mark) + margin_of(mark)) / _MARK_PX, boldest_of(mark) / _BOLD_PX)
-        for mark in design.marks.values()
-    )
-    r = max(1.0, smallest * scale, max(scan.width, scan.height) / _LONGEST)
-    overview, reduction = scan.overview(int(np.ceil(max(scan.width, scan.height) / r)))
-    grey = np.ascontiguousarray(overview.mean(axis=2))
-    patterns = find_patterns(
-        grey,
-        design,
-        scale / reduction,
-        within,
-        attitudes(options.rotation, options.mirrored),
-        options.max_tilt_deg,
-        scan.full_scale / 255 * 0.6,
-    )
+    candidates = Candidates.of_scan(scan, overview_size(scan, design, scale))
+    reduction = candidates.reduction
+    negative = (False, True) if options.negative is None else (options.negative,)
+    ways = [(attitude, n) for n in negative for attitude in attitudes(options.rotation, options.mirrored)]
+    patterns = find_patterns(candidates, design, scale / reduction, within, ways, options.max_tilt_deg)
     if not patterns:
         return []
     # Attitudes that use the same candidates are compared after the measurement.
     distinct: list[Pattern] = []
     for pattern in patterns:
-        if not any(_same_places(pattern, other) for other in distinct):
+        if not any(same_places(pattern, other) for other in distinct):
             distinct.append(pattern)
     return [(pattern, reduction) for pattern in distinct]
-
-
-def _same_places(one: Pattern, other: Pattern) -> bool:
-    a, b = (p.xy[np.isfinite(p.xy).all(axis=1)] for p in (one, other))
-    near = np.hypot(*(a[:, None] - b[None]).transpose(2, 0, 1)).min(axis=1) < 3.0
-    return bool(near.all())
 
 
 def _measured(
@@ -265,9 +258,10 @@ def _measured(
     expected = design.xy @ linear.T + shift
     seen: Mask = np.asarray(np.isfinite(start).all(axis=1))
     columns = _Columns.empty(n)
-    _look(scan, design, linear, np.where(seen[:, None], start, expected), 2.0 * reduction, columns, range(n))
+    shown = design.reversed() if pattern.negative else design
+    _look(scan, shown, linear, np.where(seen[:, None], start, expected), 2.0 * reduction, columns, range(n))
     scale = float(np.sqrt(abs(np.linalg.det(linear))))
-    film = _Film(pattern.attitude, (scan.width, scan.height), scale)
+    film = _Film(pattern.attitude, (scan.width, scan.height), scale, pattern.negative)
     for _ in range(2):
         _drop(design, film, columns)
         if columns.ok.sum() < 3:
@@ -283,7 +277,7 @@ def _measured(
         if not len(again):
             break
         columns.predicted = near
-        _look(scan, design, linear, near, 0.1 * scale, columns, again)
+        _look(scan, shown, linear, near, 0.1 * scale, columns, again)
     if columns.ok.sum() < max(3, n - _MISSING):
         ids = design.ids
         lost = [f"{ids[k]}: {columns.why[k]}" for k in np.flatnonzero(~columns.ok)]
@@ -298,16 +292,17 @@ def _measured(
 
 @dataclass(frozen=True)
 class _Film:
-    """How the film lies in the scan, the size of this, and pixels per mm."""
+    """How the film lies in the scan, the size of this, pixels per mm, and whether this is a negative."""
 
     attitude: Attitude
     size: tuple[int, int]
     scale: float
+    negative: bool
 
     @classmethod
     def of(cls, result: FiducialResult, attitude: Attitude) -> _Film:
         """The film of a result in an attitude."""
-        return cls(attitude, result.size, result.px_per_mm)
+        return cls(attitude, result.size, result.px_per_mm, result.negative)
 
     def coordinates(self, xy: Array) -> Array:
         """Scan coordinates (mm) of pixels (n, 2)."""
@@ -329,12 +324,14 @@ class _Fitted:
 
 
 class _Places(Protocol):
-    """Pixels (n, 2) of marks with their covariances (n, 2, 2)."""
+    """Pixels (n, 2) of marks with their covariances (n, 2, 2), and what these have in common."""
 
     @property
     def xy(self) -> Array: ...
     @property
     def cov(self) -> Array: ...
+    @property
+    def common(self) -> Array: ...
 
 
 @dataclass
@@ -348,6 +345,7 @@ class _Columns:
     likeness: Array
     psf_px: Array
     predicted: Array
+    common: Array
 
     @classmethod
     def empty(cls, n: int) -> _Columns:
@@ -360,6 +358,7 @@ class _Columns:
             np.zeros(n),
             np.full(n, np.nan),
             none.copy(),
+            np.zeros((n, 2, 2)),
         )
 
 
@@ -382,7 +381,7 @@ def _look(
         sigma = (
             float(np.sqrt(np.nanmax(np.diag(found.cov[i])))) if np.isfinite(found.cov[i]).all() else np.inf
         )
-        limit = max(_MOST_SIGMA_PX, _MOST_SIGMA_MM * scale)
+        limit = _OFF_MM * scale  # beyond it the others could not tell whether this is the mark
         why: str = ""
         moved = float(np.hypot(*(found.xy[i] - at[k])))
         if one.seen[0] < 0.5:
@@ -396,7 +395,7 @@ def _look(
         elif sigma > limit:
             why = Reason(f"its standard deviation would be {sigma:.2g} px", Code.UNCERTAIN)
         columns.ok[k], columns.why[k] = why == "", why
-        columns.xy[k], columns.cov[k] = found.xy[i], found.cov[i]
+        columns.xy[k], columns.cov[k], columns.common[k] = found.xy[i], found.cov[i], found.common[i]
         columns.likeness[k], columns.psf_px[k] = one.correlation[0], level * one.psf_px[0]
         columns.predicted[k] = at[k]
 
@@ -404,7 +403,7 @@ def _look(
 def _fitted(design: FiducialDesign, film: _Film, marks: _Places, keep: Mask, kind: Kind) -> _Fitted | Failure:
     """Fit a transformation to some of the marks; the weights contain the irregular deformation of film."""
     turn = film.attitude.matrix / film.scale
-    cov = turn.T @ marks.cov[keep] @ turn + _FILM_MM**2 * np.eye(2)
+    cov = turn.T @ (marks.cov - marks.common)[keep] @ turn + _FILM_MM**2 * np.eye(2)
     points = ImagePoints(tuple(np.array(design.ids)[keep].tolist()), film.coordinates(marks.xy[keep]), cov)
     target, sigma = design.xy[keep], np.repeat(design.sigma[keep][:, None], 2, axis=1)
     fit = fit_mapping(TRANSFORMS[kind], points, target, sigma)
@@ -496,6 +495,8 @@ def _result(
         px_per_mm=film.scale,
         xy=columns.xy,
         cov=columns.cov,
+        common=columns.common,
+        negative=film.negative,
         ok=ok,
         why=tuple(columns.why),
         predicted=film.pixels(fitted.model, design),
@@ -503,9 +504,46 @@ def _result(
         psf_px=columns.psf_px,
         kind=kind,
         fit=fitted.fit,
+        shared=_shared(design, film, columns, fitted, kind),
         residuals=_spread(fitted.residuals, ok),
         notes=(),
     )
+
+
+def _shared(design: FiducialDesign, film: _Film, columns: _Places, fitted: _Fitted, kind: Kind) -> Array:
+    """What errors of learnt marks add to the covariance of the transformation's parameters.
+
+    All marks of a kind are displaced alike in the plane of the mark; the transformation is fitted again with
+    these displacements.
+    """
+    ok: Mask = np.asarray(np.isfinite(columns.xy).all(axis=1))
+    linear = film.scale * film.attitude.matrix
+    total = np.zeros((len(fitted.fit.values),) * 2)
+    for name, mark in design.marks.items():
+        rows = [k for k in np.flatnonzero(ok).tolist() if design.points[k].mark == name]
+        if mark.learnt is None or not rows:
+            continue
+        moves = {k: moves_of(design, k, linear)[0] for k in rows}
+        back = [np.linalg.inv(moves[k]) @ columns.common[k] @ np.linalg.inv(moves[k]).T for k in rows]
+        value, vector = np.linalg.eigh(np.mean(back, axis=0))
+        for step in (vector * np.sqrt(np.maximum(value, 0.0))).T:
+            xy = columns.xy.copy()
+            for k in rows:
+                xy[k] += moves[k] @ step
+            moved = _fitted(design, film, _Moved(xy, columns.cov, columns.common), ok, kind)
+            if not isinstance(moved, Failure):
+                change = moved.fit.values - fitted.fit.values
+                total += np.outer(change, change)
+    return total
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """Marks at other places."""
+
+    xy: Array
+    cov: Array
+    common: Array
 
 
 def _spread(residuals: Array, ok: Mask) -> Array:
@@ -515,19 +553,16 @@ def _spread(residuals: Array, ok: Mask) -> Array:
     return every
 
 
-def _oriented(result: FiducialResult, options: FiducialOptions) -> FiducialResult:
-    """Compare the other attitudes in which the same marks fit: the coordinates may tell, or nothing does."""
-    own = _misfit(result, result.attitude, np.arange(len(result.ok)))
-    rivals = []
-    for attitude in attitudes(options.rotation, options.mirrored):
-        if attitude == result.attitude:
-            continue
-        order = _exchanged(result, attitude)
-        if order is not None:
-            rivals.append((_misfit(result, attitude, order), attitude, order))
-    if not rivals:
+def _oriented(scan: Scan, result: FiducialResult, options: FiducialOptions) -> FiducialResult:
+    """Compare the attitudes in which the same marks fit: images and coordinates may tell, or nothing does."""
+    ways = attitudes(options.rotation, options.mirrored)
+    orders = {attitude: _exchanged(result, attitude) for attitude in ways}
+    fits = {attitude: order for attitude, order in orders.items() if order is not None}
+    likelihood = _likelihoods(scan, result, fits)
+    likely = [attitude for attitude in fits if likelihood[attitude] > max(likelihood.values()) - _CERTAIN]
+    every = [(_misfit(result, attitude, fits[attitude]), attitude, fits[attitude]) for attitude in likely]
+    if not every:
         return result
-    every = [(own, result.attitude, np.arange(len(result.ok))), *rivals]
     best = min(every, key=lambda each: each[0])
     others = [each for each in every if each[1] != best[1]]
     radius = float(np.hypot(*(result.design.xy - result.design.xy.mean(axis=0)).T).max())
@@ -558,14 +593,40 @@ def _exchanged(result: FiducialResult, attitude: Attitude) -> Rows | None:
     extent = float(np.ptp(design.xy))
     if len(set(order.tolist())) < len(order) or away.min(axis=1).max() > 0.01 * extent:
         return None
-    for k, j in enumerate(order.tolist()):
-        one = formed_mark(design, k, 8.0 / reach_of(design.marks[design.points[k].mark]) * attitude.matrix)
-        other = formed_mark(
-            design, j, 8.0 / reach_of(design.marks[design.points[j].mark]) * result.attitude.matrix
-        )
-        if one.shape != other.shape or np.corrcoef(one.ravel(), other.ravel())[0, 1] < 0.9:
-            return None
     return np.asarray(order, dtype=np.intp)
+
+
+def _likelihoods(scan: Scan, result: FiducialResult, fits: dict[Attitude, Rows]) -> dict[Attitude, float]:
+    """Logarithms of the likelihoods of attitudes by the images of the marks; equal where these are alike."""
+    design = result.design.reversed() if result.negative else result.design
+    own = _linear_of(design, result.predicted, result.px_per_mm * result.attitude.matrix)
+    seen: dict[int, list[tuple[Any, tuple[float, float]]]] = {}
+
+    def fit(k: int, at: int, linear: Array) -> tuple[float, float]:
+        """Fit of the image of a mark at the place of one; what shows the same figure fits the same."""
+        mark = design.marks[design.points[k].mark]
+        fine = 8.0 / reach_of(mark) if mark.learnt is None else mark.learnt.px_per_mm
+        image = formed_mark(design, k, fine / result.px_per_mm * linear)
+        noise = 0.0 if mark.learnt is None else mark.learnt.noise / 1000
+        for other, found in seen.setdefault(at, []):
+            if other.shape == image.shape and same_figure(image, other, noise):
+                return found
+        fitted = fit_of(scan, design, k, linear, result.xy[at], float(result.psf_px[at]))
+        seen[at].append((image, fitted))
+        return fitted
+
+    found = {}
+    # The own attitude first: others that show the same figures fit as it does.
+    for attitude in sorted(fits, key=lambda each: each != result.attitude):
+        linear = own @ np.linalg.inv(result.attitude.matrix) @ attitude.matrix
+        rows = enumerate(fits[attitude].tolist())
+        found[attitude] = {at: fit(k, at, linear) for k, at in rows if result.ok[at]}
+    total = dict.fromkeys(fits, 0.0)
+    for at in np.flatnonzero(result.ok).tolist():
+        count = min(each[at] for each in found.values())[1]  # as the best image leaves them
+        for attitude, each in found.items():
+            total[attitude] -= count / 2 * float(np.log(max(each[at][0], 1e-12)))
+    return total
 
 
 def _renamed(result: FiducialResult, attitude: Attitude, order: Rows) -> FiducialResult:
@@ -575,6 +636,7 @@ def _renamed(result: FiducialResult, attitude: Attitude, order: Rows) -> Fiducia
         attitude=attitude,
         xy=result.xy[order],
         cov=result.cov[order],
+        common=result.common[order],
         ok=result.ok[order],
         why=tuple(result.why[i] for i in order),
         likeness=result.likeness[order],
@@ -587,6 +649,7 @@ def _renamed(result: FiducialResult, attitude: Attitude, order: Rows) -> Fiducia
     return replace(
         renamed,
         fit=fitted.fit,
+        shared=_shared(result.design, film, renamed, fitted, result.kind),
         residuals=_spread(fitted.residuals, renamed.ok),
         predicted=film.pixels(fitted.model, result.design),
     )

@@ -40,6 +40,10 @@ class FiducialResult(Display, Overlaid):
         Scale.
     xy, cov : ndarray (n, 2), (n, 2, 2)
         Marks in pixels of the scan; NaN where not measured.
+    common : ndarray (n, 2, 2)
+        What the covariances contain of errors of a learnt mark, which all marks of its kind have.
+    negative : bool
+        Whether the scan shows bright marks of the design dark, and dark ones bright.
     ok : ndarray of bool (n,)
         Which marks were measured.
     why : tuple of str (n,)
@@ -52,6 +56,8 @@ class FiducialResult(Display, Overlaid):
         Of the transformation.
     fit : Adjustment
         The transformation from scan coordinates to the calibrated ones.
+    shared : ndarray (u, u)
+        Covariance of its parameters by errors of learnt marks.
     residuals : ndarray (n, 2)
         Transformed minus calibrated coordinates, mm.
     notes : tuple of Remark
@@ -70,8 +76,8 @@ class FiducialResult(Display, Overlaid):
     >>> fit = fit_mapping(RationalPolynomial.similarity(), ImagePoints.with_sigma("123", uv, 0.01), uv)
     >>> found = FiducialResult(
     ...     "7.tif", "", design, (2300, 2300), Attitude(0, False), 10.0, 1149.5 + uv * [10, -10],
-    ...     np.tile(0.01 * np.eye(2), (3, 1, 1)), one > 0, ("", "", ""), none, one, one,
-    ...     "similarity", fit, none, ())
+    ...     np.tile(0.01 * np.eye(2), (3, 1, 1)), np.zeros((3, 2, 2)), False, one > 0, ("", "", ""), none,
+    ...     one, one, "similarity", fit, np.zeros((4, 4)), none, ())
     >>> found.document().marks[0].at.x, found.sigma_mm
     (2149.5, (0.0, 0.0))
     """
@@ -84,6 +90,8 @@ class FiducialResult(Display, Overlaid):
     px_per_mm: float
     xy: Array
     cov: Array
+    common: Array
+    negative: bool
     ok: Mask
     why: tuple[str, ...]
     predicted: Array
@@ -91,6 +99,7 @@ class FiducialResult(Display, Overlaid):
     psf_px: Array
     kind: Kind
     fit: Adjustment
+    shared: Array
     residuals: Array
     notes: tuple[Remark, ...]
 
@@ -106,14 +115,14 @@ class FiducialResult(Display, Overlaid):
     @property
     def covariance(self) -> Array:
         """Covariance matrix of the transformation's parameters; enlarged where residuals ask for it."""
-        return self.fit.covariance
+        return np.asarray(self.fit.covariance + self.shared)
 
     def _facts(self) -> list[tuple[str, str]]:
         sigma = self.sigma_mm
         return [
             ("image", self.image),
             ("measured", f"{int(self.ok.sum())} of {len(self.ok)}"),
-            ("film", str(self.attitude)),
+            ("film", f"{self.attitude}, negative" if self.negative else str(self.attitude)),
             (
                 self.kind,
                 "no residuals" if sigma is None else f"residuals {sigma[0]:.2g}, {sigma[1]:.2g} mm",
@@ -161,6 +170,7 @@ class FiducialResult(Display, Overlaid):
             px_per_mm=self.px_per_mm,
             rotation_deg=self.attitude.rotation,  # type: ignore[arg-type]
             mirrored=self.attitude.mirrored,
+            negative=self.negative,
             marks=marks,
             transform=transform,
             covariance=tuple(tuple(map(float, row)) for row in self.covariance),

@@ -21,10 +21,19 @@ from numpy.typing import NDArray
 from ...calibration import film_axes
 from ...core.data import Array, Rows
 from ...io import FiducialDesign
+from ...io.scans import Scan
 from ...optics.formation import PixelResponse
 from ..matching.shapes import Window
-from .forms import contours_of, margin_of, outlined, reach_of
+from .forms import margin_of, reach_of, shape_of, thicknesses
+from .learnt import OWN_PSF
 
+_MARK_PX, _BOLD_PX, _LONGEST = 24.0, 1.0, 3000
+"""Size of the smallest mark with its surroundings, and width of its boldest part, in the overview; largest
+longer side of that."""
+_UNEVEN = 0.05
+"""Difference of a mark from itself, turned, that its making explains, in units of its contrast, one sigma."""
+_SAME_FORM = 0.98
+"""Correlation of two images of marks from which the same places look like both: noise of a learnt mark."""
 _CANDIDATES = 80
 """Most candidates for each form of a mark."""
 _LEAST = 0.35
@@ -92,6 +101,8 @@ class Pattern:
         Candidates in the overview, NaN for marks without one.
     likeness : ndarray (n,)
         Their correlations with the formed marks; 0 without a candidate.
+    negative : bool
+        Whether bright marks are dark in the scan, and dark ones bright.
     """
 
     attitude: Attitude
@@ -99,6 +110,7 @@ class Pattern:
     shift: Array
     xy: Array
     likeness: Array
+    negative: bool = False
 
     @property
     def score(self) -> float:
@@ -124,16 +136,42 @@ def formed_mark(design: FiducialDesign, k: int, linear: Array, psf: float = 0.8)
     mark = design.marks[point.mark]
     scale = float(np.sqrt(abs(np.linalg.det(linear))))
     half = max(3, int(np.ceil((reach_of(mark) + margin_of(mark)) * scale)))
-    shape = outlined(
-        [contours_of(mark, reach_of(mark) + margin_of(mark))],
-        (linear @ turned(point.turn_deg))[None],
-        0.7 * psf,
-        np.ones(3),
-    )
+    shape = shape_of(mark, linear @ turned(point.turn_deg), 0.7 * psf, np.ones(3))
     along = np.arange(-half, half + 1.0)[None]
     window = Window(along, along, PixelResponse())
-    share = shape.image(np.zeros((1, 2)), np.array([psf]), np.zeros((1, 3)), np.array([0]), window)[0]
+    width = np.array([psf if mark.learnt is None else OWN_PSF])
+    none = np.zeros((1, shape.parameters))
+    share = shape.image(np.zeros((1, 2)), width, none, np.array([0]), window)[0]
     return np.asarray(share if mark.polarity == "bright" else -share, dtype=np.float32)
+
+
+def odds_of_same(difference: float, whole: float) -> float:
+    """Odds that two images of a mark, or one and itself when it is turned, show the same figure.
+
+    Parameters
+    ----------
+    difference : float
+        Rms difference beyond noise on the mark, in units of its contrast. It is normal if the mark is made
+        unevenly, and as probable as any up to `whole` if the figures are two.
+    whole : float
+        Rms value of the mark there.
+    """
+    uneven = np.exp(-((difference / _UNEVEN) ** 2) / 2) * np.sqrt(2 / np.pi) / _UNEVEN
+    return float(uneven * whole)
+
+
+def same_figure(one: NDArray[np.float32], other: NDArray[np.float32], noise: float) -> bool:
+    """Whether two images (h, w) of marks show the same figure; `noise` is that of each."""
+    on = np.maximum(np.abs(one), np.abs(other)) > 0.1
+    square = ((one[on] - other[on]) ** 2).mean() - 2 * noise**2
+    return odds_of_same(float(np.sqrt(max(square, 0.0))), float(np.sqrt((one[on] ** 2).mean()))) > 1
+
+
+def same_places(one: Pattern, other: Pattern) -> bool:
+    """Whether two patterns have the same marks, each perhaps with another name."""
+    a, b = (p.xy[np.isfinite(p.xy).all(axis=1)] for p in (one, other))
+    near = np.hypot(*(a[:, None] - b[None]).transpose(2, 0, 1)).min(axis=1) < 3.0
+    return bool(near.all()) and one.negative == other.negative
 
 
 def turned(degrees: float) -> Array:
@@ -150,63 +188,120 @@ def least_scales(design: FiducialDesign, size: tuple[float, float]) -> tuple[flo
     return _FILLED * most, most
 
 
-def find_patterns(
-    overview: NDArray[np.float32],
-    design: FiducialDesign,
-    scale: float,
-    within: float,
-    allowed: list[Attitude],
-    max_tilt_deg: float,
-    step: float,
-) -> list[Pattern]:
-    """Find the pattern of the marks, in each attitude in which it fits.
+def overview_size(scan: Scan, design: FiducialDesign, scale: float) -> int:
+    """Longer side of an overview in which marks at a scale (px/mm) are just large enough to be found."""
+    # Thin lines of large marks would vanish in an overview in which the marks are just large enough.
+    smallest = min(
+        min(2 * (reach_of(mark) + margin_of(mark)) / _MARK_PX, thicknesses(mark)[1] / _BOLD_PX)
+        for mark in design.marks.values()
+    )
+    longer = max(scan.width, scan.height)
+    return int(np.ceil(longer / max(1.0, smallest * scale, longer / _LONGEST)))
+
+
+class Candidates:
+    """Places of an overview that look like marks.
 
     Parameters
     ----------
     overview : ndarray (h, w)
         Reduced grey values.
+    step : float
+        Smallest difference of grey values that may be a mark.
+    reduction : float
+        Pixels of the scan in one of the overview.
+
+    Examples
+    --------
+    >>> from reseau.io import FiducialMark, FiducialPoint, MarkPart
+    >>> dot = FiducialMark(polarity="dark", parts=(MarkPart(shape="disk", size=0.6),))
+    >>> places = ((10.0, 0.0), (0.0, 10.0), (-10.0, 0.0))
+    >>> points = tuple(FiducialPoint(id=str(k), x=x, y=y, mark="dot") for k, (x, y) in enumerate(places))
+    >>> design = FiducialDesign(name="", marks={"dot": dot}, points=points)
+    >>> grey = np.full((60, 60), 9, np.float32)
+    >>> grey[20:27, 30:37] = 200
+    >>> Candidates(grey, 1.0).of(design, 0, 10 * np.eye(2), True)[0]  # of a negative
+    array([[33., 23.]])
+    """
+
+    def __init__(self, overview: NDArray[np.float32], step: float, reduction: float = 1.0) -> None:
+        self.overview, self.step, self.reduction = overview, step, reduction
+        self._seen: list[tuple[NDArray[np.float32], list[tuple[Array, Array]]]] = []
+        self._known: dict[tuple[object, ...], list[tuple[Array, Array]]] = {}
+        self._flat: dict[int, NDArray[np.bool_]] = {}
+
+    @classmethod
+    def of_scan(cls, scan: Scan, size: int) -> Candidates:
+        """Those of an overview of a scan, whose longer side has `size` pixels."""
+        overview, reduction = scan.overview(size)
+        return cls(np.ascontiguousarray(overview.mean(axis=2)), scan.full_scale / 255 * 0.6, reduction)
+
+    def of(self, design: FiducialDesign, k: int, linear: Array, negative: bool) -> tuple[Array, Array]:
+        """Positions (m, 2) and correlations (m,) of a mark; `linear` is from camera coordinates to pixels."""
+        point = design.points[k]
+        turn = design.marks[point.mark], np.rint(1e6 * linear @ turned(point.turn_deg)).tobytes()
+        if turn not in self._known:
+            self._known[turn] = self._found(formed_mark(design, k, linear))
+        return self._known[turn][negative]
+
+    def _found(self, template: NDArray[np.float32]) -> list[tuple[Array, Array]]:
+        """Those of one image of a mark, and of its negative; of images that hardly differ the same."""
+        side = len(template)
+        for other, found in self._seen:
+            if len(other) == side and np.corrcoef(template.ravel(), other.ravel())[0, 1] > _SAME_FORM:
+                return found
+        if side not in self._flat:
+            self._flat[side] = _spread(self.overview, side) < self.step
+        self._seen.append((template, _peaks(self.overview, template, self._flat[side])))
+        return self._seen[-1][1]
+
+
+def find_patterns(
+    candidates: Candidates,
+    design: FiducialDesign,
+    scale: float,
+    within: float,
+    allowed: list[tuple[Attitude, bool]],
+    max_tilt_deg: float,
+    known: dict[int, Array] | None = None,
+) -> list[Pattern]:
+    """Find the pattern of the marks, in each attitude in which it fits.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        Of the overview.
     design : FiducialDesign
         The camera.
     scale, within : float
         Scale of the overview in px/mm, and its relative uncertainty.
-    allowed : list of Attitude
-        Possible attitudes.
+    allowed : list of (Attitude, bool)
+        Possible attitudes, and whether the scan is a negative.
     max_tilt_deg : float
         Largest rotation besides that of the attitude.
-    step : float
-        Smallest difference of grey values that may be a mark.
+    known : dict of int to ndarray (2,), optional
+        Places of marks that are known.
 
     Returns
     -------
     list of Pattern
         The best for each attitude, the highest score first.
     """
-    known: dict[tuple[str, bytes], bytes] = {}
-    seen: dict[bytes, tuple[Array, Array]] = {}
-    flat: dict[int, NDArray[np.bool_]] = {}
-
-    def candidates(k: int, attitude: Attitude) -> tuple[Array, Array]:
-        point = design.points[k]
-        turn = point.mark, np.rint(1e6 * attitude.matrix @ turned(point.turn_deg)).tobytes()
-        if turn in known:
-            return seen[known[turn]]
-        template = formed_mark(design, k, scale * attitude.matrix)
-        key = known[turn] = np.rint(20 * template).astype(np.int8).tobytes()
-        if key not in seen:
-            side = len(template)
-            if side not in flat:
-                flat[side] = _spread(overview, side) < step
-            seen[key] = _peaks(overview, template, flat[side])
-        return seen[key]
-
     found = []
-    for attitude in allowed:
-        each = [candidates(k, attitude) for k in range(len(design.points))]
-        best = _combined(design.xy @ (scale * attitude.matrix).T, each, within, max_tilt_deg)
+    for attitude, negative in allowed:
+        linear = scale * attitude.matrix
+        each = [
+            (known[k][None], np.ones(1))
+            if known and k in known
+            else candidates.of(design, k, linear, negative)
+            for k in range(len(design.points))
+        ]
+        best = _combined(design.xy @ linear.T, each, within, max_tilt_deg)
         if best is not None:
             chosen, likeness = best
-            fitted = _similarity(design.xy, chosen, scale * attitude.matrix)
-            found.append(Pattern(attitude, *fitted, chosen, likeness))
+            found.append(
+                Pattern(attitude, *_similarity(design.xy, chosen, linear), chosen, likeness, negative)
+            )
     return sorted(found, key=lambda pattern: -pattern.score)
 
 
@@ -219,21 +314,24 @@ def _spread(image: NDArray[np.float32], side: int) -> NDArray[Any]:
 
 def _peaks(
     image: NDArray[np.float32], template: NDArray[np.float32], flat: NDArray[np.bool_]
-) -> tuple[Array, Array]:
-    """Positions (m, 2) and values (m,) of the largest maxima of the normalised correlation."""
+) -> list[tuple[Array, Array]]:
+    """Positions (m, 2) and values (m,) of the largest maxima of the correlation, and of its negative."""
     half = len(template) // 2
     if min(image.shape) <= len(template):
-        return np.empty((0, 2)), np.empty(0)
+        return [(np.empty((0, 2)), np.empty(0))] * 2
     # Marks may be cut by the edge of the scan.
     padded = cv2.copyMakeBorder(image, half, half, half, half, cv2.BORDER_REFLECT_101)
     r = cv2.matchTemplate(padded, template, cv2.TM_CCOEFF_NORMED)
     r[flat | ~np.isfinite(r)] = 0.0
-    apart = 2 * max(2, half // 2) + 1
-    top = (r == cv2.dilate(r, np.ones((apart, apart), np.uint8))) & (r > _LEAST)
-    rows, columns = np.nonzero(top)
-    order = np.argsort(-r[rows, columns], kind="stable")[:_CANDIDATES]
-    rows, columns = rows[order], columns[order]
-    return np.stack([columns, rows], axis=1).astype(np.float64), r[rows, columns].astype(np.float64)
+    around = np.ones((2 * max(2, half // 2) + 1,) * 2, np.uint8)
+    found = []
+    for value in (r, -r):
+        rows, columns = np.nonzero((value == cv2.dilate(value, around)) & (value > _LEAST))
+        order = np.argsort(-value[rows, columns], kind="stable")[:_CANDIDATES]
+        rows, columns = rows[order], columns[order]
+        places = np.stack([columns, rows], axis=1).astype(np.float64)
+        found.append((places, value[rows, columns].astype(np.float64)))
+    return found
 
 
 def _combined(

@@ -11,11 +11,14 @@ import scipy
 from numpy.typing import NDArray
 
 from ...core.data import Array, Mask
-from ...io import FiducialDesign
+from ...io import FiducialDesign, FiducialMark
 from ...io.scans import Scan
+from ...optics.formation import PixelResponse
 from ..matching import Matches, match
 from ..matching.patches import MatchOptions
-from .forms import contours_of, margin_of, outlined, reach_of
+from ..matching.shapes import Window
+from .forms import contours_of, margin_of, outlined, reach_of, shape_of, thicknesses
+from .learnt import OWN_PSF
 from .search import formed_mark, turned
 
 _HALF = 48
@@ -51,12 +54,15 @@ class MatchedMarks:
         The match of each mark in its window; one row each.
     reduction : ndarray (k,)
         Reduction of each window.
+    common : ndarray (k, 2, 2)
+        What the covariances contain of errors of a learnt mark, which all marks of its kind have.
     """
 
     xy: Array
     cov: Array
     matches: list[Matches]
     reduction: Array
+    common: Array
 
 
 def grey_window(
@@ -174,7 +180,59 @@ def match_marks(
     for i, matched in enumerate(found):
         xy[i] = first[i] + reduction[i] * matched.xy[0]
         cov[i] = reduction[i] ** 2 * _correlated(matched, spreads[i], on_marks)
-    return MatchedMarks(xy, cov, found, reduction.astype(np.float64))
+    common = np.zeros_like(cov)
+    for i, (k, matched) in enumerate(zip(rows, found, strict=True)):
+        mark = design.marks[design.points[k].mark]
+        if (learnt := mark.learnt) is not None:
+            own, ratio = moves_of(design, k, linear)
+            # Noise of the example in the residuals, by their scales and what reductions average.
+            depth = matched.contrast[0] * (1.0 if mark.polarity == "bright" else matched.level[0])
+            grain = learnt.noise / 1000 * abs(float(depth)) * min(1.0, 1 / (ratio * reduction[i]))
+            share = min(1.0, (grain / max(float(matched.noise[0]), 1e-9)) ** 2)
+            sxx, syy, sxy = learnt.covariance
+            place = own @ np.array([[sxx, sxy], [sxy, syy]]) @ own.T
+            common[i], cov[i] = share * cov[i] + place, cov[i] + place
+    return MatchedMarks(xy, cov, found, reduction.astype(np.float64), common)
+
+
+def moves_of(design: FiducialDesign, k: int, linear: Array) -> tuple[Array, float]:
+    """From displacements of the point in the image of a learnt mark to those in a scan, and their scale."""
+    learnt = design.marks[design.points[k].mark].learnt
+    assert learnt is not None
+    own = linear @ turned(design.points[k].turn_deg) @ np.linalg.inv(np.array(learnt.linear))
+    return own, float(1 / np.sqrt(abs(np.linalg.det(own))))
+
+
+def fit_of(
+    scan: Scan, design: FiducialDesign, k: int, linear: Array, at: Array, psf_px: float
+) -> tuple[float, float]:
+    """Variance of the grey values around a mark about its image at a place, and how many independent ones.
+
+    Parameters
+    ----------
+    scan, design, k, linear
+        As of :func:`tracked`.
+    at : ndarray (2,)
+        Place of the mark, pixels of the scan.
+    psf_px : float
+        Width of the point-spread function, pixels of the scan.
+    """
+    level, point = _reduction(design, k, linear), design.points[k]
+    mark, scale = design.marks[point.mark], np.sqrt(abs(np.linalg.det(linear))) / level
+    half = int(np.ceil((reach_of(mark) + margin_of(mark)) * scale))
+    grey, inside, first = grey_window(scan, at, half, level)
+    shape = shape_of(mark, linear / level @ turned(point.turn_deg), 0.5, np.ones(3))
+    along = np.arange(2 * half + 1.0)[None]
+    window, form = Window(along, along, PixelResponse()), np.zeros((1, shape.parameters))
+    share = shape.image(((at - first) / level)[None], np.array([psf_px / level]), form, np.array([0]), window)
+    y, x = np.mgrid[-1 : 1 : grey.shape[0] * 1j, -1 : 1 : grey.shape[1] * 1j]
+    columns = np.stack([np.ones_like(x), x, y, share[0]], axis=-1)[inside]
+    left = np.zeros(grey.shape)
+    left[inside] = grey[inside] - columns @ np.linalg.lstsq(columns, grey[inside], rcond=None)[0]
+    variance = float((left**2).mean())
+    near = float((left[1:] * left[:-1]).mean() + (left[:, 1:] * left[:, :-1]).mean()) / 2
+    a = float(np.clip(near / max(variance, 1e-12), 0.0, 0.95))
+    return variance, left.size * ((1 - a) / (1 + a)) ** 2
 
 
 def _spread_by_grey(found: list[Matches], formed: list[Array]) -> Callable[[Array], Array]:
@@ -212,17 +270,15 @@ def _matched(
     scale = float(np.sqrt(abs(np.linalg.det(linear))))
     half = int(np.ceil((reach_of(mark) + margin_of(mark)) * scale)) + 2
     grey, inside, first = grey_window(scan, at, half, level)
-    thinnest = min(part.line_width or part.width or part.size for part in mark.parts)
+    thinnest = thicknesses(mark)[0]
     spread = max(_SPREAD_MM, _SPREAD * thinnest if thinnest < 0.5 else 0.0) * scale
     spread = float(np.hypot(spread, _SPREAD_PX / level))
-    shape = outlined(
-        [contours_of(mark, reach_of(mark) + margin_of(mark))],
-        (linear @ turned(point.turn_deg))[None],
-        0.5,
-        np.array([_SIZE, _TURN, spread]),
-    )
-    noise = max(_quiet(grey, inside), scan.full_scale / 255 * 0.3 / level)
+    axes = linear @ turned(point.turn_deg)
+    shape = shape_of(mark, axes, 0.5, np.array([_SIZE, _TURN, spread]))
+    noise = max(quiet(grey, inside), scan.full_scale / 255 * 0.3 / level)
     start = np.array([[half, half]], dtype=np.float64) + (at - first) / level - half
+    if any(part.use == "ignore" for part in mark.parts):
+        inside = inside & ~_ignored(mark, axes, start, half)
     options = MatchOptions(
         half_px=half,
         psf_log_sigma=0.5,
@@ -230,9 +286,10 @@ def _matched(
         start_px=1.0,
         influence=True,
         background=1,
+        within_px=np.inf if mark.learnt is None else reach_of(mark) * scale - 2.0,
     )
     best: Matches | None = None
-    for psf in _WIDTHS:
+    for psf in _WIDTHS if mark.learnt is None else (OWN_PSF, 2 * OWN_PSF):
         found = match(
             grey,
             inside,
@@ -240,7 +297,7 @@ def _matched(
             start,
             replace(options, psf_px=psf),
             noise=noise,
-            form_sigma=np.ones(3),
+            form_sigma=np.ones(shape.parameters),
         )
         if best is None or _better(found, best):
             best = found
@@ -250,6 +307,16 @@ def _matched(
     return best, first, grey
 
 
+def _ignored(mark: FiducialMark, axes: Array, at: Array, half: int) -> Mask:
+    """Pixels of a window that what is ignored beside a mark may reach."""
+    shape = outlined([contours_of(mark, reach_of(mark), True)], axes[None], 0.5, np.ones(3))
+    along = np.arange(2 * half + 1.0)[None]
+    share = shape.image(
+        at, np.ones(1), np.zeros((1, 3)), np.array([0]), Window(along, along, PixelResponse())
+    )
+    return np.asarray(share[0] > 1e-3)
+
+
 def _better(one: Matches, other: Matches) -> bool:
     """Whether a match is better than another: it converged, and leaves less."""
     if one.converged[0] != other.converged[0]:
@@ -257,7 +324,7 @@ def _better(one: Matches, other: Matches) -> bool:
     return bool(one.noise[0] * (1 + one.rejected[0]) < 0.999 * other.noise[0] * (1 + other.rejected[0]))
 
 
-def _quiet(grey: NDArray[np.float32], inside: Mask) -> float:
+def quiet(grey: NDArray[np.float32], inside: Mask) -> float:
     """Standard deviation of independent noise, from second differences."""
     bend = grey[1:-1, 1:-1] - 0.25 * (grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:])
     used = bend[inside[1:-1, 1:-1]]

@@ -134,7 +134,7 @@ class ReseauOptions:
     nominal_within_px: float | None = None
     mirrored: v.Mirrored | None = None
     max_rotation_deg: v.MaxRotationDeg | None = None
-    mark_px: float | None = None
+    mark_px: v.MarkPx | None = None
     psf_px: v.PsfPx = 0.6
     row_jitter_px: v.RowJitterPx = 0.0
     fill: v.Fill = 1.0
