@@ -35,7 +35,7 @@ CAMERA = {
 }
 """Pages that use what the tour of a camera has made."""
 ALONE = (
-    "coded-testfield", "fiducial-marks", "n-wire-phantom", "reseau-on-film", "sensor-from-files",
+    "coded-testfield", "fiducial-marks", "learnt-marks", "n-wire-phantom", "reseau-on-film", "sensor-from-files",
     "several-cameras", "sharpness", "sheet-of-disks", "temperature-zoom-focus", "turntable",
     "when-an-adjustment-fails",
 )  # fmt: skip
