@@ -42,6 +42,7 @@ from ..solver.problem import LAST_ROUND, BundleFit, BundleProblem
 from ..solver.unknowns import Unknowns
 from ..solver.values import Values
 from .one_station import one_station
+from .other_starts import compared
 from .rejection import MANY, bent_plane, many_rejected, suspects, without_gross_errors
 from .startup import RETRIED, adjusted_in_steps, lost_images, settled
 
@@ -310,16 +311,17 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         _, of_control = (None, []) if grave else _control(problem, fit)
     n = len(network.xy)
     rejected = np.asarray(fit.rejected[: 2 * n].reshape(n, 2).any(axis=1))
+    fit, others = (fit, ()) if grave else compared(fit)
     without_depth = None if grave else one_station(problem, fit)
     if without_depth is not None:
         return without_depth
-    bare = Result(network, fit, rejected, steps)
+    bare = Result(network, fit, rejected, steps, others=others)
     if not grave:
         found += _doubts(problem, fit, of_control, given)
         found += [] if of_control else _rejected_control(network, rejected)
         found += _frontal(network, bare)
     found += many_rejected(network, rejected)
-    return Result(network, fit, rejected, steps, (*found, *notes, *checks(bare)))
+    return replace(bare, warnings=(*found, *notes, *checks(bare)))
 
 
 def _without_statistics(problem: BundleProblem) -> Remark:
