@@ -161,6 +161,8 @@ def is_ambiguous(xyz: Array, x0: Array, rotation: Array, sigma: float, seen: Arr
         right = [one @ shift, other @ shift]
         z, w = dots[2] * right[0] - dots[1] * right[1], dots[0] * right[1] - dots[1] * right[0]
         if 2 * least.cost < 2 * np.log(1000.0) and (z > 0).all() and (w > 0).all():
+            # Full turns are none.
+            least.x[:3] = Rotation.from_rotvec(least.x[:3]).as_rotvec()
             found = max(found, float(np.abs(least.x / sigmas).max()))
     return True if found**2 > 2 * CHANCE else False if found**2 < 1.3 * CHANCE else None
 

@@ -32,7 +32,13 @@ from ..diagnostics.control_check import (
 )
 from ..diagnostics.result import Result
 from ..diagnostics.stage_check import checked_readings, without_readings
-from ..diagnostics.suspects import contradicting, doubtful_parameters, grouped, without_false_bars
+from ..diagnostics.suspects import (
+    contradicting,
+    doubtful_parameters,
+    grouped,
+    uneven_axes,
+    without_false_bars,
+)
 from ..network.network import Network, finite
 from ..network.rig import RigValues
 from ..network.stage import Stage
@@ -321,7 +327,10 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         found += [] if of_control else _rejected_control(network, rejected)
         found += _frontal(network, bare)
     found += many_rejected(network, rejected)
-    return replace(bare, warnings=(*found, *notes, *checks(bare)))
+    said = checks(bare)
+    if any(remark.code is Code.SIGMAS_DOUBTFUL for remark in found):
+        said = [remark for remark in said if remark.code is not Code.GROSS_ERRORS]
+    return replace(bare, warnings=(*found, *notes, *said))
 
 
 def _without_statistics(problem: BundleProblem) -> Remark:
@@ -522,6 +531,10 @@ def _doubts(
         tie: Mask = np.asarray(np.isnan(problem.network.sigma).any(axis=1))[problem.network.point_of]
         rows = suspects(problem) if not of_control or tie.any() else np.zeros(0, dtype=np.intp)
         rows = rows[tie[rows]] if of_control else rows
+        uneven = uneven_axes(problem, rows) if len(rows) else []
+        if uneven:
+            # What else contradicts does so by these weights.
+            return uneven
         if len(rows) and not held:
             doubts += [*grouped(problem.network, rows), _gross(problem.network, rows)]
     return doubts
@@ -606,7 +619,7 @@ def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) ->
             share = 100 * len(rows) / max(len(network.xy), 1)
             said = f"{len(rows)} of {len(network.xy)} image points ({share:.0f} %) contradict the others"
             first = Remark(f"{said}: reject them (`--reject`)", Code.GROSS_ERRORS)
-            found = [first, *grouped(network, rows), _gross(network, rows)]
+            found = uneven_axes(problem, rows) or [first, *grouped(network, rows), _gross(network, rows)]
         elif failure.code in (Code.NOT_CONVERGED, Code.NOT_FINITE):
             found = _worst_images(network, _misfits_px(problem))
     if not found:
