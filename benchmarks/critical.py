@@ -9,8 +9,9 @@ adjusted as ``reseau bundle`` does.
 Two images are ambiguous where distances from epipolar lines (Sampson) without errors allow, along the weakest
 combination of the relative orientation, another one that is ten times less probable by standard deviations
 than by these distances, or from random starts another minimum before both images with an excess below
-2 ln 1000, and clear where it is as probable within a third. Intervals of 95 % are those of
-rotations between images, in networks without the code `ambiguous`.
+2 ln 1000, or where the weakest combination has a standard deviation of 0.1 (rad) and more; and clear where
+it is as probable within a third. Intervals of 95 % are those of rotations between images, in networks without
+the code `ambiguous`.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from reseau.core.failure import Code
 
 SURFACES = ("cylinder", "hyperboloid", "cone", "plane", "volume")
 CAMERA = np.array([12.0, 0.0, 0.0, 0.0, 0.0])
-LEAST, CHANCE = 15, 2 * np.log(10.0)
+LEAST, CHANCE, SINGULAR = 15, 2 * np.log(10.0), 0.1
 
 
 class Case(NamedTuple):
@@ -132,6 +133,8 @@ def is_ambiguous(xyz: Array, x0: Array, rotation: Array, sigma: float, seen: Arr
 
     slope = scipy.optimize.approx_fprime(np.zeros(5), off, 1e-7)
     values, vectors = np.linalg.eigh(slope.T @ slope)
+    if values[0] < 1 / SINGULAR**2:
+        return True
     scale = vectors / np.sqrt(np.maximum(values, 1e-12))
     sigmas = np.linalg.norm(scale, axis=1)
 

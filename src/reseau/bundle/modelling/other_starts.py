@@ -35,6 +35,7 @@ _POSES, _SAME, _TURNED = 3, 1e-3, 8
 _ALONE = 100.0
 
 
+@np.errstate(all="ignore")
 def compared(fit: BundleFit) -> tuple[BundleFit, tuple[OtherSolution, ...]]:
     """Return the best solution, and others that the observations allow and standard deviations exclude.
 
@@ -43,6 +44,7 @@ def compared(fit: BundleFit) -> tuple[BundleFit, tuple[OtherSolution, ...]]:
     fit : BundleFit
         An adjustment.
     """
+    # Starts may be where no ray is.
     if not comparable(fit):
         return fit, ()
     fits = [fit, *_from_other_starts(fit)]
@@ -121,7 +123,9 @@ def _other_pairs(fit: BundleFit) -> Iterator[Values]:
     for pair in relative_orientations(uv[rows[a][left]], uv[rows[b][right]], _PAIRS):
         x0, rotation = np.full((2, len(network.images), 3), np.nan)
         x0[a], x0[b], rotation[a], rotation[b] = 0.0, pair.x0, 0.0, matrix_to_vector(pair.rotation)
-        found = approximate(replace(network.select(used), x0=x0, rotation=rotation))
+        # Approximate coordinates belong to the other orientation.
+        alone = replace(network.select(used), xyz=np.full_like(network.xyz, np.nan))
+        found = approximate(replace(alone, x0=x0, rotation=rotation))
         yield _scaled(fit, replace(fit.values, rotation=found.rotation, x0=found.x0, xyz=found.xyz))
 
 
