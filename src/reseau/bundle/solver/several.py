@@ -31,8 +31,8 @@ def poses_of(xyz: Array, uv: Array, count: int) -> list[Resection]:
     --------
     >>> xyz = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.2]])
     >>> seen = xyz + [0.1, 0.2, 3.0]
-    >>> [pose.x0.round(3).tolist() for pose in poses_of(xyz, seen[:, :2] / seen[:, 2:], 1)]
-    [[-0.1, -0.2, -3.0]]
+    >>> sorted(pose.x0.round(3).tolist() for pose in poses_of(xyz, seen[:, :2] / seen[:, 2:], 4))
+    [[-0.1, -0.2, -3.0], [0.025, 2.603, -1.592]]
     """
     turn = towards(uv)
     ray = np.column_stack([uv, np.ones(len(uv))]) @ turn.T
