@@ -327,10 +327,13 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         found += [] if of_control else _rejected_control(network, rejected)
         found += _frontal(network, bare)
     found += many_rejected(network, rejected)
-    said = checks(bare)
-    if any(remark.code is Code.SIGMAS_DOUBTFUL for remark in found):
-        said = [remark for remark in said if remark.code is not Code.GROSS_ERRORS]
-    return replace(bare, warnings=(*found, *notes, *said))
+    return replace(bare, warnings=(*found, *notes, *_checked(bare, found)))
+
+
+def _checked(result: Result, found: list[Remark]) -> list[Remark]:
+    """What checks find; no gross errors where the standard deviations of an axis make them."""
+    wrong = any(remark.code is Code.SIGMAS_DOUBTFUL for remark in found)
+    return [each for each in checks(result) if not (wrong and each.code is Code.GROSS_ERRORS)]
 
 
 def _without_statistics(problem: BundleProblem) -> Remark:
