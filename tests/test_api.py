@@ -90,6 +90,7 @@ def test_packages_that_share_a_name_with_a_function_are_callable_and_stay_packag
         (lambda: reseau.calibrate(5, GRID), "images: is of type int"),  # type: ignore[arg-type]
         (lambda: reseau.read_image(COLOUR), "colours: is None, and the array has three channels"),
         (lambda: reseau.calibrate([3, 4, 5], GRID), "photograph: is of type int"),  # type: ignore[list-item]
+        (lambda: reseau.calibrate({"a": [GREY, GREY], "b": [GREY]}, GRID), "images: are 2 of a, 1 of b"),
         (lambda: reseau.orient(3), "scan: is of type int"),  # type: ignore[arg-type]
         (lambda: reseau.refine(), "refine: needs PHOTO I and its reseau"),
         (lambda: reseau.refine(GREY, GRID, photo_ii=GREY), "must be given together"),

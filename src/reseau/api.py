@@ -7,8 +7,8 @@ is a falsy :class:`~reseau.core.failure.Failure` with its reason; its ``required
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -42,7 +42,7 @@ from .measure.testfield.measure import TestfieldOptions
 from .procedures.calibrated import Calibrated
 from .procedures.calibrating import calibrate_photographs
 from .procedures.calibration_options import CalibrationOptions, CameraOptions
-from .procedures.exposures import photographs_named
+from .procedures.exposures import Taken, exposures_of_files, photographs_named
 from .procedures.film_frame import FrameOptions, FrameResult, orient_scan
 from .procedures.refined import Refined
 from .procedures.refining import Photographs, RefineOptions, refine_photographs
@@ -265,34 +265,37 @@ def measure(
 
 
 def calibrate(
-    images: PathLike | Iterable[PhotoLike],
+    images: PathLike | Iterable[PhotoLike] | Mapping[str, PathLike | Iterable[PhotoLike]],
     design: DesignLike = "auto",
     *,
-    model: str | CameraOptions | None = None,
+    model: str | CameraOptions | Mapping[str, str | CameraOptions] | None = None,
     pitch_mm: float | None = None,
     free: Sequence[str] = (),
-    image_size: tuple[int, int] | None = None,
+    image_size: tuple[int, int] | Mapping[str, tuple[int, int]] | None = None,
     options: CalibrationOptions | None = None,
     sensor: CalibrationLike | None = None,
     channel: Channel = "luma",
     colours: Colours | None = None,
 ) -> Calibrated | Failure:
-    """Calibrate a camera from photographs of a target.
+    """Calibrate a camera, or cameras that are fixed to each other, from photographs of a target.
 
     Parameters
     ----------
-    images : str or Path, or iterable of str, Path, ndarray, Frame or ImagePoints
-        A folder, or photographs of one size, folders of them, or the coordinates measured in them.
+    images : str or Path, or iterable of str, Path, ndarray, Frame or ImagePoints, or mapping of str to these
+        A folder, or photographs of one size, folders of them, or the coordinates measured in them. Of several
+        cameras by their names: files with the same name, or the same last number in it, were taken at once;
+        of others as many in the same order.
     design : str, Path, ReseauDesign, TestfieldDesign or BoardDesign
         The target; ``auto`` looks for it, among the designs beside the photographs and the usual ones.
-    model : str or CameraOptions, optional
-        Name of the camera model; by default it is chosen, see :func:`reseau.bundle.choose_models`. With
-        `free` alone it is ``brown`` where the pixel size is given, else ``opencv``.
+    model : str or CameraOptions, or mapping of str to these, optional
+        Name of the camera model, of all cameras or of those named; by default it is chosen, see
+        :func:`reseau.bundle.choose_models`. With `free` alone it is ``brown`` where the pixel size is given,
+        else ``opencv``.
     pitch_mm : float, optional
         Size of a pixel in millimetres.
     free : sequence of str
         Parameters to estimate; by default the usual ones of the model.
-    image_size : (int, int), optional
+    image_size : (int, int), or mapping of str to (int, int), optional
         Width and height in pixels, where no photograph gives them.
     options : CalibrationOptions, optional
         Options of the adjustment.
@@ -323,12 +326,27 @@ def calibrate(
     >>> reseau.calibrate(images, design, free=("fx", "fy", "cx", "cy"), image_size=(640, 480))
     <Calibrated: usable ..., 4 images, 140 image points, 0 declined, sigma0 0.000, fx 800.00... px, ...>
     """
-    if not isinstance(model, CameraOptions):
-        model = CameraOptions(model or ("" if free else "auto"), tuple(free), pitch_mm)
 
+    def lens(given: str | CameraOptions | None) -> CameraOptions:
+        if isinstance(given, CameraOptions):
+            return given
+        return CameraOptions(given or ("" if free else "auto"), tuple(free), pitch_mm)
+
+    taken = dict[str, Taken]()
+    if isinstance(images, Mapping):
+        photographs, taken = _of_cameras(images, channel, colours)
+    else:
+        photographs = _named(images, channel, colours)
+    lenses: CameraOptions | dict[str, CameraOptions]
+    if isinstance(model, Mapping):
+        lenses = {
+            camera: lens(model.get(camera)) for camera in {*model, *(each.camera for each in taken.values())}
+        }
+    else:
+        lenses = lens(model)
     return calibrate_photographs(
-        _named(images, channel, colours), None if design == "auto" else read_design(design), image_size,
-        model, options, channel=channel, correction=_correction(sensor),
+        photographs, None if design == "auto" else read_design(design), image_size, lenses, options, taken,
+        channel=channel, correction=_correction(sensor),
     )  # fmt: skip
 
 
@@ -517,6 +535,31 @@ def _named(
     if not named:
         raise UsageError("is empty", where="images", do="give photographs, or their folder")
     return named
+
+
+def _of_cameras(
+    images: Mapping[str, PathLike | Iterable[PhotoLike]], channel: Channel, colours: Colours | None
+) -> tuple[list[tuple[str, Path | Frame | ImagePoints]], dict[str, Taken]]:
+    """Photographs of several cameras with their names, and which were taken at once."""
+    every = {camera: _named(own, channel, colours) for camera, own in images.items()}
+    files = {camera: [each for _, each in own if isinstance(each, Path)] for camera, own in every.items()}
+    if all(len(files[camera]) == len(own) for camera, own in every.items()):
+        found = exposures_of_files(files)
+        return [(name, path) for name, (path, _) in found.items()], {k: at for k, (_, at) in found.items()}
+    counts = {camera: len(own) for camera, own in every.items()}
+    if len(set(counts.values())) > 1:
+        raise UsageError(
+            f"are {', '.join(f'{count} of {camera}' for camera, count in counts.items())}", where="images",
+            do="give as many of each camera, those that were taken at once at the same place",
+        )  # fmt: skip
+    named = list[tuple[str, Path | Frame | ImagePoints]]()
+    taken = {}
+    for camera, own in every.items():
+        for k, (name, photo) in enumerate(own):
+            key = f"{camera}/{name}"
+            named.append((key, replace(photo, name=key) if isinstance(photo, Frame) else photo))
+            taken[key] = Taken(camera, str(k))
+    return named, taken
 
 
 def _path(given: object, argument: str, expected: str) -> Path:

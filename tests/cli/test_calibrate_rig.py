@@ -9,11 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from reseau.api import calibrate
 from reseau.calibration import Calibration
+from reseau.core.errors import UsageError
 from reseau.designs import regular_reseau
 from reseau.io import Mark
-from reseau.optics import OpenCV, Pose, project
+from reseau.optics import OpenCV, PixelGrid, Pose, camera_model, project
+from reseau.optics.mapping import PlaneMapping
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
+from reseau.procedures.calibration_options import CameraOptions
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -26,10 +30,9 @@ CAMERAS = {
 FREE = ("--image-size", "640x480", "--free", "fx,fy,cx,cy,k1,k2")
 
 
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A design, and the coordinates that two cameras with wide lenses saw, in two folders."""
-    folder, rng = tmp_path_factory.mktemp("stereo"), np.random.default_rng(2)
+def drawn(folder: Path, lenses: dict[str, tuple[PlaneMapping, tuple[int, int]]]) -> Path:
+    """A design, and the coordinates that cameras saw, in a folder each."""
+    rng = np.random.default_rng(2)
     design = regular_reseau(9, 7, 25.0, Mark(shape="disk", size=5.0), name="disks")
     design.write(folder / "disks.json")
     xyz = np.column_stack([design.xy, np.zeros(len(design.ids))])
@@ -41,9 +44,10 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
         at = -first.T @ np.array([-40.0, 5.0 * np.cos(3 * about), 330.0])
         places = {"left": (first, at), "right": (rotation_matrix(TURN) @ first, at + first.T @ BASE)}
         for camera, (turn, centre) in places.items():
-            seen = project(OpenCV.from_parameters(CAMERAS[camera]), Pose(matrix_to_vector(turn), centre), xyz)
+            lens, size = lenses[camera]
+            seen = project(lens, Pose(matrix_to_vector(turn), centre), xyz)
             xy = seen.xy + SIGMA * rng.normal(size=seen.xy.shape)
-            inside = ((xy > 0) & (xy < [640, 480])).all(axis=1)
+            inside = ((xy > 0) & (xy < size)).all(axis=1)
             rows = [
                 f"{name},{x!r},{y!r},{SIGMA},{SIGMA}"
                 for name, (x, y), ok in zip(design.ids, xy.tolist(), inside, strict=True)
@@ -52,6 +56,13 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
             (folder / camera).mkdir(exist_ok=True)
             (folder / camera / f"{e:02d}.csv").write_text("id,x,y,sx,sy\n" + "\n".join(rows) + "\n")
     return folder
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What two cameras with wide lenses saw."""
+    lenses = {name: (OpenCV.from_parameters(values), (640, 480)) for name, values in CAMERAS.items()}
+    return drawn(tmp_path_factory.mktemp("stereo"), lenses)
 
 
 def both(folder: Path) -> tuple[object, ...]:
@@ -84,6 +95,18 @@ def test_each_camera_and_its_place_are_within_their_sigmas(
     assert "right/00.csv" in report
 
 
+@pytest.mark.slow
+def test_a_folder_has_the_rig_for_other_programs_and_maps_of_rectified_images(
+    reseau: Run, measured: Path, tmp_path: Path
+) -> None:
+    command = ("calibrate", *both(measured), "-d", measured / "disks.json", *FREE)
+    status, out, err = reseau(*command, "-o", tmp_path / "rig")
+    assert (status, err) == (0, "")
+    names = {path.name for path in (tmp_path / "rig").iterdir()}
+    assert {"camchain.yaml", "rig_config.json", "rectified.npz"} < names
+    assert "rectified images, maps for cv2.remap: rows off by " in out
+
+
 @pytest.fixture
 def exchanged(measured: Path, tmp_path: Path) -> Path:
     """The same, with two files of the right camera exchanged."""
@@ -106,3 +129,31 @@ def test_images_that_were_not_taken_at_once_are_named(reseau: Run, exchanged: Pa
     place = Calibration.read(tmp_path / "K-right.json").place
     assert place is not None
     assert np.abs(np.array(place.base) - BASE).max() < 0.5
+
+
+@pytest.mark.parametrize("of_all", ["opencv", pytest.param("auto", marks=pytest.mark.slow)])
+def test_each_camera_may_have_a_model_and_a_size_of_its_own(reseau: Run, of_all: str, tmp_path: Path) -> None:
+    true = np.array([420.0, 421.0, 513.0, 380.0, 0.03, -0.01, 0.0, 0.0, 0.0, 0.0])
+    fisheye = camera_model("fisheye").mapping(true, PixelGrid(1024, 768, (1.0, 1.0)))
+    left = OpenCV.from_parameters(CAMERAS["left"]), (640, 480)
+    drawn(tmp_path, {"left": left, "right": (fisheye, (1024, 768))})
+    rig = ("--rig", f"left={tmp_path / 'left'}", "--rig")
+    own = f"right={tmp_path / 'right'},model=fisheye,free=fx,fy,cx,cy,k1,k2,image-size=1024x768"
+    files = ("-d", tmp_path / "disks.json", "-o", tmp_path / "K.json")
+    status, _, err = reseau("calibrate", *rig, own, *files, "--model", of_all, "--image-size", "640x480")
+    assert (status, err) == (0, "")
+    one, other = (Calibration.read(tmp_path / f"K-{name}.json") for name in ("left", "right"))
+    assert one.sigma0 == pytest.approx(1.0, abs=0.1)
+    assert (one.model["model"], other.model["model"]) == ("opencv", "fisheye")
+    for key, value in zip(("fx", "fy", "cx", "cy", "k1", "k2"), true.tolist(), strict=False):
+        assert abs(other.parameters[key].value - value) < 4.5 * other.parameters[key].sigma
+    both = {name: [tmp_path / name] for name in ("left", "right")}
+    lenses = {"left": of_all, "right": CameraOptions("fisheye", ("fx", "fy", "cx", "cy", "k1", "k2"))}
+    sizes = {"left": (640, 480), "right": (1024, 768)}
+    again = calibrate(both, tmp_path / "disks.json", model=lenses, image_size=sizes).required()
+    assert again.cameras["right"]["k1"] == other.parameters["k1"].value
+    assert again.rectified("right").greatest_px < 0.5
+    with pytest.raises(UsageError, match="is none of left, right"):
+        again.rectified("front")
+    wrong = own.replace("model=", "pitch-mm=1,focus=")
+    assert reseau("calibrate", *rig, wrong, *files)[0] == 2

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import scipy
 import yaml
 
 from reseau.calibration import Calibration
@@ -486,6 +487,19 @@ def test_a_chain_of_kalibr_leads_from_each_camera_to_the_next(tmp_path: Path) ->
     for k, (turn, base) in enumerate(((TURN, BASE), (-2 * TURN, -3 * BASE)), start=1):
         at = np.array(chain[f"cam{k}"]["T_cn_cnm1"]) @ at
         assert np.abs(at[:3] - rotation_matrix(turn) @ (point - 1e-3 * base)).max() < 1e-12
+
+
+def test_a_rig_of_colmap_leads_from_its_first_camera_to_the_others(tmp_path: Path) -> None:
+    pair = [calibration("radial"), placed("fisheye", "radial", TURN, BASE)]
+    export_rig(pair, "colmap", tmp_path / "rig_config.json")
+    ((first, second),) = (each["cameras"] for each in json.loads((tmp_path / "rig_config.json").read_text()))
+    assert (first["image_prefix"], first["ref_sensor"]) == ("radial/", True)
+    assert second["camera_model_name"] == "OPENCV_FISHEYE"
+    w, *axis = second["cam_from_rig_rotation"]
+    turn = scipy.spatial.transform.Rotation.from_quat([*axis, w]).as_matrix()
+    point = np.array([0.3, -0.2, 1.5])
+    there = turn @ point + np.array(second["cam_from_rig_translation"])
+    assert np.abs(there - rotation_matrix(TURN) @ (point - 1e-3 * BASE)).max() < 1e-12
 
 
 @pytest.mark.parametrize(

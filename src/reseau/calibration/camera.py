@@ -9,7 +9,7 @@ a rotation, the derivatives J by the parameters become (I − G(GᵀG)⁻¹Gᵀ)
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import numpy as np
@@ -94,7 +94,35 @@ class CameraMapping(CalibratedMapping):
     def models(self) -> list[tuple[float, CameraMapping]]:
         """The camera by each model, with its probability; the chosen one first."""
         others = [(each.probability, each.lens) for each in self.rivals]
-        return [(1.0 - sum(p for p, _ in others), self), *others]
+        own = replace(self, covariance=self.within, rivals=())
+        return [(1.0 - sum(p for p, _ in others), own), *others]
+
+    @property
+    def within(self) -> Array:
+        """Covariance (u, u) of the parameters if the model is the right one."""
+        between = [each.probability * np.outer(moves, moves) for each, moves in self._described]
+        return self.covariance - np.sum(between, axis=0) if between else self.covariance
+
+    @property
+    def _described(self) -> list[tuple[Rival, Array]]:
+        """Models of other kinds of which is known what they change of the parameters, and these changes."""
+        return [(each, each.moves) for each in self.rivals if each.moves is not None]
+
+    def by_models(self, uv: Array) -> Array:
+        """Displacements (n, 2, m) of the images of rays by models of other kinds, weighted.
+
+        The sum of their squares is what the choice of the model adds to the variance, the covariance being
+        :attr:`within`. Where a model has no image of a ray, it says nothing.
+        """
+        found = np.zeros((len(uv), 2, len(self._described)))
+        if not found.size:
+            return found
+        own = self.mapping.derivatives(uv)
+        turn = own.d_xy @ by_rotation(uv, self.mapping.parallel)
+        for k, (each, _) in enumerate(self._described):
+            off = each.lens.mapping(uv) - own.value - turn @ each.rotation
+            found[:, :, k] = np.sqrt(each.probability) * np.nan_to_num(off)
+        return found
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -108,17 +136,21 @@ class CameraMapping(CalibratedMapping):
 
     @property
     def parameter_covariance(self) -> Array:
-        """That of the parameters that were estimated."""
-        return self.covariance
+        """That of the parameters that were estimated, and of the displacements by other models."""
+        u, m = len(self.rows), len(self._described)
+        found = np.eye(u + m)
+        found[:u, :u] = self.within
+        return found
 
     def derivatives(self, xy: Array) -> tuple[Array, Array, Array]:
         """Directions of pixels; see :meth:`CalibratedMapping.derivatives`."""
         uv = self.mapping.inverse(xy)
         known = np.isfinite(uv).all(axis=1)
         seen = self.mapping.derivatives(uv[known])
-        slope, by_parameters = np.full((len(xy), 2, 2), np.nan), np.full((len(xy), 2, len(self.rows)), np.nan)
+        moved = np.concatenate([seen.d_parameters[:, :, self.rows], self.by_models(uv[known])], axis=2)
+        slope, by_parameters = np.full((len(xy), 2, 2), np.nan), np.full((len(xy), *moved.shape[1:]), np.nan)
         slope[known] = np.linalg.inv(seen.d_xy)
-        by_parameters[known] = -slope[known] @ seen.d_parameters[:, :, self.rows]
+        by_parameters[known] = -slope[known] @ moved
         return uv, slope, by_parameters
 
     def to_pixels(self, xy: Array) -> Array:
@@ -154,6 +186,7 @@ class CameraMapping(CalibratedMapping):
         extra: dict[str, Any] | None = model.get("additional")
         values = calibration.values()
         rivals: list[dict[str, Any]] = calibration.validity.get("rivals", [])
+        names, n = calibration.covariance.names, len(calibration.covariance.names)
         if (model.get("shutter") or {}).get("mode") == "line":
             raise FormatError("is that of a line camera: its images have no directions", where=where)
         if extra is not None and extra["per"] != "camera":
@@ -165,12 +198,13 @@ class CameraMapping(CalibratedMapping):
                 raise ValueError("probabilities of models are none")
             if any(each.lens.size != (model["width"], model["height"]) for each in others):
                 raise ValueError("models are of images of different sizes")
+            if any(each.moves is not None and each.moves.shape != (n,) for each in others):
+                raise ValueError("models change other parameters")
         except (UsageError, KeyError, IndexError, TypeError, ValueError) as error:
             raise FormatError(f"has a damaged or unknown model: {error}", where=where) from None
         unknown = [name for name in values if name not in mapping.names]
         if unknown:
             raise FormatError(f"the model {model['model']!r} has no parameter {unknown[0]!r}", where=where)
-        names, n = calibration.covariance.names, len(calibration.covariance.names)
         matrix = np.array(calibration.covariance.matrix).reshape(n, n)
         size, extent = (model["width"], model["height"]), extent_of(calibration.validity)
         dof = calibration.validity.get("degrees_of_freedom")
@@ -210,22 +244,32 @@ class Rival:
         The camera with this model.
     model : mapping
         The model as in a calibration.
+    moves : ndarray (u,), optional
+        Changes of the estimated parameters of the chosen model which describe it best where points were seen;
+        they are in the covariance of these parameters. None: the covariance contains all that it does.
+    rotation : ndarray (3,)
+        Rotation of the rays between the chosen model and this one, which orientations contain.
     """
 
     probability: float
     lens: CameraMapping
     model: Mapping[str, Any] = field(default_factory=dict)
+    moves: Array | None = None
+    rotation: Array = field(default_factory=lambda: np.zeros(3))
 
     def entry(self) -> dict[str, Any]:
         """What a calibration says of it."""
         mapping = self.lens.mapping
-        return {
+        found = {
             "probability": self.probability,
             "model": dict(self.model),
             "parameters": dict(zip(mapping.names, np.asarray(mapping.values).tolist(), strict=True)),
             "estimated": list(self.lens.names),
             "covariance": self.lens.covariance.tolist(),
         }
+        if self.moves is not None:
+            found |= {"moves": self.moves.tolist(), "rotation": self.rotation.tolist()}
+        return found
 
     @classmethod
     def from_entry(cls, entry: Mapping[str, Any]) -> Self:
@@ -235,7 +279,9 @@ class Rival:
             _mapping(model, values), (model["width"], model["height"]), values, tuple(entry["estimated"]),
             np.array(entry["covariance"], dtype=np.float64).reshape(2 * (len(entry["estimated"]),)),
         )  # fmt: skip
-        return cls(float(entry["probability"]), lens, model)
+        moves, rotation = entry.get("moves"), np.array(entry.get("rotation", np.zeros(3)), dtype=np.float64)
+        own = None if moves is None else np.array(moves, dtype=np.float64)
+        return cls(float(entry["probability"]), lens, model, own, rotation.reshape(3))
 
 
 def _mapping(model: Mapping[str, Any], values: Mapping[str, float]) -> PlaneMapping:
@@ -337,8 +383,8 @@ def projection_field(lens: CameraMapping, across: int = 25, down: int | None = N
     (2, 3)
     """
     xy, shape = places(lens, across, down)
-    slope, reach_deg = projection_slopes(lens, xy)
-    cov = slope @ lens.covariance @ np.swapaxes(slope, 1, 2)
+    slope, reach_deg = _slopes(lens, xy)
+    cov = slope @ lens.parameter_covariance @ np.swapaxes(slope, 1, 2)
     return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2), reach_deg)
 
 
@@ -367,13 +413,18 @@ def projection_slopes(lens: CameraMapping, xy: Array) -> tuple[Array, float]:
     >>> projection_slopes(camera, np.array([[0.0, 0.0], [639.0, 0.0], [0.0, 479.0]]))[0].shape
     (3, 2, 1)
     """
+    slope, reach_deg = _slopes(lens, xy)
+    return slope[:, :, : len(lens.rows)], reach_deg
+
+
+def _slopes(lens: CameraMapping, xy: Array) -> tuple[Array, float]:
+    """The same, and beside them the displacements by other models."""
     uv = lens.mapping.inverse(xy)
     known = np.isfinite(uv).all(axis=1)
     seen = lens.mapping.derivatives(uv[known])
-    slope = np.full((len(xy), 2, len(lens.rows)), np.nan)
-    slope[known] = referred(
-        seen.d_xy @ by_rotation(uv[known], lens.mapping.parallel), seen.d_parameters[:, :, lens.rows]
-    )
+    moved = np.concatenate([seen.d_parameters[:, :, lens.rows], lens.by_models(uv[known])], axis=2)
+    slope = np.full((len(xy), *moved.shape[1:]), np.nan)
+    slope[known] = referred(seen.d_xy @ by_rotation(uv[known], lens.mapping.parallel), moved)
     return slope, reach(uv[known], lens)
 
 

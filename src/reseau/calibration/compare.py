@@ -187,10 +187,11 @@ def calibration_difference(
     variance. The parameters themselves are not compared: what many of them do together is known much better
     than each, and where they are hardly determined they are no linear functions of the image points.
 
-    A calibration whose model was chosen is one of several, with their probabilities. What they differ in is
-    a part of the covariance, as if it were normal; where it is not, the probability of the difference is its
-    mean over the pairs of models (Meng 1994, *Annals of Statistics* 22: posterior predictive p-values). The
-    larger one counts: where only the choice of the model differs, the cameras need not.
+    A calibration whose model was chosen is one of several, with their probabilities. What they differ in at
+    each place is a part of the covariance, as if it were normal; where it is not, the probability of the
+    difference is its mean over the pairs of models (Meng 1994, *Annals of Statistics* 22: posterior
+    predictive p-values). The larger one counts: where only the choice of the model differs, the cameras need
+    not.
 
     Examples
     --------
@@ -241,8 +242,9 @@ def _difference(
         if not (np.isfinite(g).all() and np.isfinite(off).all()):
             raise UsageError("do not image the same rays", where="calibrations")
         if k in (0, _ROUNDS - 1):
-            own = there.d_parameters[:, :, second.rows]
-            carried = there.d_xy @ by_uv @ np.linalg.inv(here.d_xy) @ here.d_parameters[:, :, first.rows]
+            own = np.concatenate([there.d_parameters[:, :, second.rows], second.by_models(turned)], axis=2)
+            moved = np.concatenate([here.d_parameters[:, :, first.rows], first.by_models(uv[rows])], axis=2)
+            carried = there.d_xy @ by_uv @ np.linalg.inv(here.d_xy) @ moved
             by_first, by_second = referred(g, carried, weight[rows]), referred(g, own, weight[rows])
             root = _joint_root(first, second, by_first, by_second)
         if k == 0 and root.size:
@@ -278,7 +280,7 @@ def _joint_dof(first: CameraMapping, second: CameraMapping, by_first: Array, by_
     """Degrees of freedom of the sum of two covariances (Satterthwaite 1946), of their traces over the
     field."""
     parts = [
-        float(np.einsum("nij,jk,nik->", by, lens.covariance, by))
+        float(np.einsum("nij,jk,nik->", by, lens.parameter_covariance, by))
         for by, lens in ((by_first, first), (by_second, second))
     ]
     spread = sum(part**2 / lens.dof for part, lens in zip(parts, (first, second), strict=True))
@@ -289,8 +291,11 @@ def _joint_root(first: CameraMapping, second: CameraMapping, by_first: Array, by
     """A root (g, 2, k) of the covariance of the differences."""
     if type(first.mapping) is type(second.mapping) and first.names == second.names:
         # Derivatives at two estimates differ by their errors, which must not add dimensions of their own.
-        return (by_first + by_second) / 2 @ _root(first.covariance + second.covariance)
-    parts = [by_first @ _root(first.covariance), by_second @ _root(second.covariance)]
+        u = len(first.rows)
+        mean = (by_first[:, :, :u] + by_second[:, :, :u]) / 2
+        parts = [mean @ _root(first.within + second.within), by_first[:, :, u:], by_second[:, :, u:]]
+    else:
+        parts = [by_first @ _root(first.parameter_covariance), by_second @ _root(second.parameter_covariance)]
     return np.concatenate(parts, axis=2)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,7 +12,7 @@ import typer
 from ..core import vocabulary as v
 from ..core.errors import UsageError
 from ..core.files import writable
-from ..core.options import Group, Option
+from ..core.options import Group, Option, options_of, values_of_texts
 from .bundle_compare import read_lens
 from .bundle_options import (
     level_of,
@@ -56,8 +57,9 @@ class _Camera(CameraChoice):
 
     model: Annotated[
         v.Model,
-        "Here of all cameras; by default, or with `auto`, one is chosen for each camera. With --free alone "
-        "brown with --pitch-mm, otherwise opencv. An unknown name lists all.",
+        "Here of all cameras that --rig gives none of their own; by default, or with `auto`, one is chosen "
+        "for each camera. With --free alone brown with --pitch-mm, otherwise opencv. An unknown name lists "
+        "all.",
     ] = ""
     side: Annotated[
         Literal["image", "object"] | None,
@@ -111,6 +113,33 @@ class _Camera(CameraChoice):
             shutter = replace(shutter, free=self.motion) if self.motion else shutter
         model = self.model or ("" if self.free or options else "auto")
         return CameraOptions(model, self.free, self.pitch_mm, dict(options), shutter)
+
+
+@dataclass(frozen=True)
+class _OfRig(_Camera):
+    """What may be said of one camera of a rig."""
+
+    image_size: v.ImageSize | None = None
+
+
+def _rig(texts: list[str], camera: _Camera, size: tuple[int, int] | None) -> dict[str, tuple[str, _OfRig]]:
+    """Files of each camera of a rig, and what is said of it; what is not is that of all.
+
+    Raises
+    ------
+    UsageError
+        When an option cannot be interpreted.
+    """
+    keys = "|".join(name.replace("_", "-") for name in options_of(_OfRig))
+    found = {}
+    for name, given in pairs_of(texts, "--rig", "name=files, each name once").items():
+        files, *said = re.split(rf",(?=(?:{keys})=)", given)
+        own = pairs_of(said, f"--rig {name}", "name=files,option=value, each option once")
+        values = values_of_texts(
+            _OfRig, {key.replace("-", "_"): text for key, text in own.items()}, f"--rig {name}"
+        )
+        found[name] = files, _OfRig(**({"image_size": size} | vars(camera) | values))
+    return found
 
 
 @dataclass(frozen=True)
@@ -208,8 +237,9 @@ def calibrate(
         Option(
             "Photographs of one of several cameras that are fixed to each other, in place of IMAGES: a "
             "folder or a pattern, e.g. 'left=left/*.png'; repeatable. Files with the same name, or the same "
-            "last number in it, were taken at once.",
-            value="NAME=FILES",
+            "last number in it, were taken at once. Options of the camera model, and image-size, may follow "
+            "for this camera alone: 'front=front/*.png,model=fisheye'.",
+            value="NAME=FILES[,OPTION=VALUE]",
         ),
     ] = None,
     out: Annotated[
@@ -230,7 +260,8 @@ def calibrate(
     as_json: v.AsJson = False,
 ) -> None:
     """Calibrate a camera from photographs of a target."""
-    photographs, taken = _photographs(images or [], rig or [])
+    cameras = _rig(rig or [], camera, image_size)
+    photographs, taken = _photographs(images or [], {name: files for name, (files, _) in cameras.items()})
     files = [path for _, path in photographs]
     executor = _executor(files, computing)
     if overlay is not None and not executor.local:
@@ -253,12 +284,14 @@ def calibrate(
     if others and taken:
         raise UsageError("requires one camera", where="--against", do="compare the cameras one by one")
     options, lens = adjustment.options(), camera.options()
+    lenses = {name: own.options() for name, (_, own) in cameras.items()}
+    sizes = {name: own.image_size for name, (_, own) in cameras.items() if own.image_size is not None}
     if not computing.cluster:
         job = "auto" if target is None else "board" if isinstance(target, BoardDesign) else "calibrate"
         compile_first(job, computing.jobs)
     with executor, progress("measuring", len(files)) as step:
         found = calibrate_photographs(
-            photographs, target, image_size, lens, options, taken,
+            photographs, target, sizes if cameras else image_size, lenses or lens, options, taken,
             channel=reading.channel, correction=reading.correction,
             testfield=TestfieldOptions(row_jitter_px=row_jitter_px, fill=fill),
             overlays={name: drawn[path] for name, path in photographs if path in drawn},
@@ -278,7 +311,7 @@ def calibrate(
     }  # fmt: skip
     provenance = Provenance(
         {name: sha256_of(path) for name, path in inputs.items()},
-        settings | _settings(camera) | _settings(adjustment),
+        settings | _settings(camera) | _settings(adjustment) | ({"rig": rig} if rig else {}),
     )
     differences = _differences(done, others)
     calibrations, page = done.documents(provenance.to_dict()), ""
@@ -307,7 +340,9 @@ def _named(files: list[Path]) -> str:
     return str(one) if one.name else "photographs"
 
 
-def _photographs(images: list[Path], cameras: list[str]) -> tuple[list[tuple[str, Path]], dict[str, Taken]]:
+def _photographs(
+    images: list[Path], cameras: dict[str, str]
+) -> tuple[list[tuple[str, Path]], dict[str, Taken]]:
     """Photographs with their names; with several cameras also when each was taken."""
     from ..procedures.exposures import exposures_of_files, files_of, photographs_named
 
@@ -318,9 +353,8 @@ def _photographs(images: list[Path], cameras: list[str]) -> tuple[list[tuple[str
         return [(path.name, path) for path in photographs_named(images)], {}
     if images:
         raise UsageError("cannot be combined with --rig", where=images[0])
-    patterns = pairs_of(cameras, "--rig", "name=files, each name once")
-    files = {name: files_of(pattern) for name, pattern in patterns.items()}
-    say_files_left_out(map(Path, patterns.values()))
+    files = {name: files_of(pattern) for name, pattern in cameras.items()}
+    say_files_left_out(map(Path, cameras.values()))
     found = exposures_of_files(files)
     photographs = [(name, path) for name, (path, _) in found.items()]
     return photographs, {name: at for name, (_, at) in found.items()}

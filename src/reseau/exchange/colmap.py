@@ -19,6 +19,7 @@ from ..core.data import Array
 from ..core.errors import FormatError, UsageError
 from ..core.files import made_folder
 from ..io import read_text, write_whole
+from ..optics.poses import quaternions
 from .calibrations import calibration_formats
 from .calibrations.colmap import MODELS
 from .calibrations.formats import Exported, exported_lens
@@ -149,7 +150,7 @@ def write_colmap(result: Result, folder: Path | str) -> dict[str, Exported]:
         rows = network.rays_of_images[i]
         rows = rows[seen[rows]]
         place[rows] = np.arange(len(rows))
-        pose = [*_quaternion(turns[i]), *(-turns[i] @ fit.values.x0[i])]
+        pose = [*quaternions(turns[i : i + 1])[0], *(-turns[i] @ fit.values.x0[i])]
         name = network.images[i]
         lines.append(f"{i + 1} {_words(pose)} {network.camera_of[i] + 1} {name}")
         marks = zip(network.xy[rows] + 0.5, network.point_of[rows] + 1, strict=True)
@@ -170,12 +171,6 @@ def write_colmap(result: Result, folder: Path | str) -> dict[str, Exported]:
 
 def _words(values: Sequence[float] | Array) -> str:
     return " ".join(repr(float(value)) for value in values)
-
-
-def _quaternion(matrix: Array) -> Array:
-    """Quaternion of a rotation matrix, scalar first and not negative."""
-    x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(matrix).as_quat(canonical=True)
-    return np.array([w, x, y, z])
 
 
 class _Image(NamedTuple):

@@ -125,7 +125,7 @@ def matrix_to_vector(matrix: ArrayLike) -> Array:
     orthogonal = np.abs(flat @ flat.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0) < 1e-6
     if not orthogonal or (np.linalg.det(flat) < 0).any():
         raise UsageError("is not orthogonal with determinant +1", where="rotation matrix")
-    quaternion = _quaternions(flat)
+    quaternion = quaternions(flat)
     w, v = quaternion[:, :1], quaternion[:, 1:]
     sine = np.linalg.norm(v, axis=1, keepdims=True)
     # θ/sin(θ/2), which is 2 at θ = 0; arctan2 keeps it exact up to π.
@@ -133,9 +133,16 @@ def matrix_to_vector(matrix: ArrayLike) -> Array:
     return (factor * v).reshape(matrices.shape[:-1])
 
 
-def _quaternions(matrix: Array) -> Array:
+def quaternions(matrix: Array) -> Array:
     """Unit quaternions (n, 4), scalar first and not negative, of rotation matrices (n, 3, 3).
 
+    Examples
+    --------
+    >>> quaternions(np.eye(3)[None])
+    array([[1., 0., 0., 0.]])
+
+    Notes
+    -----
     All four columns of the outer product q·qᵀ follow from the matrix; the one with the largest diagonal is
     free of cancellation (Shepperd 1978, Quaternion from rotation matrix, J. Guidance and Control 1).
     """

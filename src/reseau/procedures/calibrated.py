@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from ..bundle import Result, calibration_of, explain
 from ..bundle.diagnostics.estimates import CameraEstimate, ImageEstimates, PointEstimates
+from ..bundle.diagnostics.evidence import in_camera
+from ..bundle.diagnostics.fields import pair_of
 from ..bundle.document import model_search_entries
 from ..bundle.explanations.explain import Explanation
 from ..bundle.explanations.names import Misnamed
@@ -22,6 +24,7 @@ from ..bundle.modelling.choice import ModelChoice
 from ..calibration import Calibration, FieldDifference
 from ..calibration.assessment import Assessment
 from ..calibration.document import Covariance
+from ..calibration.rectification import Rectification, rectified
 from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display, Table, html_table
 from ..core.errors import InputError, UsageError
@@ -277,6 +280,30 @@ class Calibrated(Estimated, Display):
         """
         second = other._only("compare") if isinstance(other, Calibrated) else other
         return self._only("compare").compare(second)
+
+    def rectified(self, camera: str, distance: float | None = None) -> Rectification:
+        """Return how the images of a camera and of the reference of its rig are rectified, and how well.
+
+        Parameters
+        ----------
+        camera : str
+            A camera that has a place with respect to another one.
+        distance : float, optional
+            Depth of points, in the unit of object space, for which the error is given; by default that of the
+            target.
+
+        Raises
+        ------
+        UsageError
+            When the camera has no place, or both do not see the same.
+        """
+        result, ids = self.result, [each.id for each in self.result.network.cameras]
+        if camera not in ids:
+            raise UsageError(f"is none of {', '.join(ids)}", where=f"camera {camera}")
+        if distance is None:
+            z = in_camera(result.fit)[:, 2]
+            distance = float(np.median(z[np.isfinite(z) & (z > 0)]))
+        return rectified(pair_of(result, ids.index(camera)), distance)
 
     def export(self, path: Path | str, *, to: str, anyway: bool = False) -> tuple[Exported, ...]:
         """Write the calibration for another program; of several cameras one file of their rig.

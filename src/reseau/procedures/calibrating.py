@@ -25,8 +25,8 @@ from .which_target import Design, target_of
 def calibrate_photographs(
     photographs: Sequence[tuple[str, Path | Frame | ImagePoints]],
     design: Design | None = None,
-    size: tuple[int, int] | None = None,
-    model: CameraOptions | None = None,
+    size: tuple[int, int] | Mapping[str, tuple[int, int]] | None = None,
+    model: CameraOptions | Mapping[str, CameraOptions] | None = None,
     options: CalibrationOptions | None = None,
     taken: Mapping[str, Taken] | None = None,
     *,

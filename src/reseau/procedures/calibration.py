@@ -70,7 +70,7 @@ def calibrate_camera(
     design: PlaneDesign,
     measure: Measurer,
     size: tuple[int, int] | Mapping[str, tuple[int, int]] | None = None,
-    model: CameraOptions | None = None,
+    model: CameraOptions | Mapping[str, CameraOptions] | None = None,
     options: CalibrationOptions | None = None,
     taken: Mapping[str, Taken] | None = None,
     executor: Executor | None = None,
@@ -90,9 +90,9 @@ def calibrate_camera(
         :func:`~reseau.procedures.target_measurement.measurer_of`.
     size : (int, int), optional
         Width and height in pixels, or those of each camera by its name; required without frames.
-    model : CameraOptions, optional
-        Camera model and parameters to estimate; by default the model is chosen, see
-        :func:`reseau.bundle.choose_models`.
+    model : CameraOptions, or mapping of str to CameraOptions, optional
+        Camera model and parameters to estimate, of all cameras or of each by its name; by default the model
+        is chosen, see :func:`reseau.bundle.choose_models`.
     options : CalibrationOptions, optional
         Options of the calibration.
     taken : mapping of str to Taken, optional
@@ -130,7 +130,12 @@ def calibrate_camera(
     tied = taken is not None or options.turntable is not None
     if unsure and not tied:
         notes += (_SHIFTED.format(few_of(tuple(unsure))),)
-    job = _Job(declined, sizes, notes, design, model, options, taken, seen.shown)
+    names, _ = _cameras_of((), taken)
+    given = model if isinstance(model, Mapping) else {} if model is None else dict.fromkeys(names, model)
+    if unknown := [name for name in given if name not in names]:
+        raise UsageError("is no camera of the photographs", where=f"model of {unknown[0]}")
+    models = {name: given.get(name, CameraOptions("auto")) for name in names}
+    job = _Job(declined, sizes, notes, design, models, options, taken, seen.shown)
     # Poses that depend on each other would contradict each other with names that are shifted.
     done = job.calibrated({k: each for k, each in measured.items() if not (tied and k in unsure)})
     if unsure and tied:
@@ -168,7 +173,7 @@ class _Job:
     sizes: Mapping[str, tuple[int, int]]
     notes: tuple[str, ...]
     design: PlaneDesign
-    model: CameraOptions | None
+    models: Mapping[str, CameraOptions]
     options: CalibrationOptions
     taken: Mapping[str, Taken] | None
     shown: str = ""
@@ -251,14 +256,15 @@ class _Job:
         refraction = None
         if options.refraction is not None:
             refraction = options.refraction.refraction(tuple(measured), tuple(cameras[c] for c in of))
-        model, larger = self.model or CameraOptions("auto"), _magnification(refraction)
-        said = Exif(focal_35_mm=options.focal_35_mm)
+        larger, said = _magnification(refraction), Exif(focal_35_mm=options.focal_35_mm)
         entries = []
         for c, name in enumerate(cameras):
             own = {image: points for (image, points), at in zip(measured.items(), of, strict=True) if at == c}
             entries.append(
                 replace(
-                    first_camera(own, design, sizes[name], model, larger, said.focal_px(*sizes[name])),
+                    first_camera(
+                        own, design, sizes[name], self.models[name], larger, said.focal_px(*sizes[name])
+                    ),
                     id=name,
                 )
             )
@@ -281,16 +287,15 @@ class _Job:
         # With all points free: what is wrong with a target must not choose the model of the lens.
         if known:
             network = replace(network, cameras=known)
-        elif model.automatic:
-            chosen = choose_models(network, options=adjustment)
+        elif automatic := [name for name in cameras if self.models[name].automatic]:
+            given = [c for c, name in enumerate(cameras) if name not in automatic]
+            chosen = choose_models(network, options=adjustment, known=given)
             if isinstance(chosen, Failure):
-                notes = (
-                    *notes,
-                    f"camera model {model.registered.name}, none could be chosen: {chosen.reason}",
-                )
+                first = self.models[automatic[0]].registered.name
+                notes = (*notes, f"camera model {first}, none could be chosen: {chosen.reason}")
             else:
                 network = replace(network, cameras=tuple(each.camera for each in chosen))
-                choices = dict(zip(cameras, chosen, strict=True))
+                choices = {c: one for c, one in zip(cameras, chosen, strict=True) if c in automatic}
         board = None
         if options.target == "flat":
             network = held_as_designed(network)
@@ -305,7 +310,8 @@ class _Job:
                 return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
             return found
         # What was not chosen may yet be there.
-        found = replace(found, rivals=tuple(each.rivals for each in choices.values()) or None)
+        others = tuple(choices[name].rivals if name in choices else None for name in cameras)
+        found = replace(found, rivals=others if choices else None)
         notes = (*notes, *_of_views(found))
         calibrated = Calibrated(found, measured, self.declined, choices, board, notes, wrong)
         loose = _without_scale(calibrated.result)
@@ -342,7 +348,9 @@ def _without_scale(result: Result) -> Failure | None:
                 continue
             how = f", which is uncertain by {100 * relative:.0f} %"
         what = f"the images do not determine {names[0] if names else 'the scale'}{how}; {_MORE_TILTED}"
-        return Failure(f"{camera.label}: {what}", Code.NOT_IDENTIFIED)
+        # What contradicts the rest makes all sigmas large.
+        first = "" if result.contradiction is None else f"{result.contradiction.text}; "
+        return Failure(f"{first}{camera.label}: {what}", Code.NOT_IDENTIFIED)
     return None
 
 

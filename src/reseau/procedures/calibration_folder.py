@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from ..calibration import Calibration, CameraMapping, CorrectedImage
-from ..calibration.assessment import Use
+from ..calibration.assessment import Use, two_digits
 from ..calibration.raster import planes_of, write_corrected
 from ..core.errors import UsageError
 from ..core.files import writable
@@ -22,7 +22,9 @@ from .calibrated import Calibrated
 
 _FILES = {"opencv": "opencv.yml", "ros": "ros.yaml", "colmap": "colmap.txt"}
 """Files for other programs, by their formats."""
-_NAMES = {"opencv": "OpenCV", "ros": "ROS", "colmap": "COLMAP"}
+_RIG = {"kalibr": "camchain.yaml", "colmap": "rig_config.json"}
+"""Files of cameras that are fixed to each other."""
+_NAMES = {"opencv": "OpenCV", "ros": "ROS", "colmap": "COLMAP", "kalibr": "Kalibr"}
 _SAMPLES = 3
 """Undistorted photographs of each camera."""
 _HOLDING = {"uint8": ".jpg", "uint16": ".png"}
@@ -106,8 +108,10 @@ def write_calibrated(
         written = calibration_folder(Path(place), calibrations, page, used, step)
         path.mkdir(exist_ok=True)
         names = [f"{name}-" * (len(used) > 1) + file for name in used for file in _FILES.values()]
-        for name in ("camchain.yaml", *names):  # of an earlier calibration
-            (path / name).unlink(missing_ok=True)
+        written += _rectified(Path(place), done, calibrations)
+        # Of an earlier calibration.
+        for old in (*(path / name for name in (*_RIG.values(), *names)), *path.glob("rectified*.npz")):
+            old.unlink(missing_ok=True)
         for file in Path(place).iterdir():
             file.replace(path / file.name)
     return written
@@ -123,7 +127,7 @@ def calibration_folder(
     """Write the calibrations of one camera, or of several that are fixed to each other, into an empty folder.
 
     The report, and each calibration; where it is usable its files for OpenCV, ROS and COLMAP, as far as these
-    have its model, those of the rig for Kalibr, and three undistorted photographs of each camera.
+    have its model, those of the rig for Kalibr and COLMAP, and three undistorted photographs of each camera.
 
     Parameters
     ----------
@@ -194,11 +198,33 @@ def _samples(
 
 
 def _rig(folder: Path, calibrations: Sequence[Calibration]) -> list[tuple[str, str]]:
-    """The cameras together, where Kalibr has their models and all are usable."""
-    assessed = [each.assessment for each in calibrations]
-    if any("kalibr" not in formats_holding(each) for each in calibrations) or any(
-        found is not None and found.use is Use.NOTHING for found in assessed
-    ):
+    """The cameras together, for programs that have their models, where all are usable."""
+    if not _usable(calibrations):
         return []
-    export_rig(calibrations, "kalibr", folder / "camchain.yaml")
-    return [("camchain.yaml", "cameras for Kalibr")]
+    holding = set.intersection(*(set(formats_holding(each)) for each in calibrations))
+    written = {to: name for to, name in _RIG.items() if to in holding}
+    for to, name in written.items():
+        export_rig(calibrations, to, folder / name)
+    return [(name, f"cameras for {_NAMES[to]}") for to, name in written.items()]
+
+
+def _usable(calibrations: Sequence[Calibration]) -> bool:
+    return not any(each.assessment and each.assessment.use is Use.NOTHING for each in calibrations)
+
+
+def _rectified(folder: Path, done: Calibrated, calibrations: Sequence[Calibration]) -> list[tuple[str, str]]:
+    """Maps that rectify the images of each camera and of its reference, where all are usable."""
+    written = list[tuple[str, str]]()
+    placed = [name for name, each in zip(done.cameras, calibrations, strict=True) if each.place is not None]
+    for name in placed if _usable(calibrations) else ():
+        file = f"rectified-{name}.npz" if len(placed) > 1 else "rectified.npz"
+        try:
+            found = done.rectified(name)
+        except UsageError as error:
+            written.append(("", f"no rectified images: {error}"))
+            continue
+        found.write(folder / file)
+        off, share = two_digits(found.greatest_px), 100 * found.common.mean()
+        what = f"maps for cv2.remap: rows off by {off} px (σ) at most, {share:.0f} % seen by both"
+        written.append((file, f"rectified images, {what}"))
+    return written

@@ -5,21 +5,22 @@ zero; what the image points, and the terms that are known, leave possible of the
 of what was estimated (Schmidt 1966, *Advances in Control Systems* 3: a filter with parameters that are
 considered, but not estimated).
 
-The displacements of the coefficients over the whole image, without what the orientation can do, are made
-orthonormal in their order: a = T β, in pixels, root mean square. The radial terms decay,
-a_j ~ N(0, (s q^j)²), the others (decentring, tilt, prism) have a size of their own. s, q and that size are as
-probable as they predict the estimates and the image points (the evidence; Bishop 2006, *Pattern Recognition
-and Machine Learning*, sect. 3.5). With the estimates x̂ of covariance C, which held coefficients θ change by
-K θ, and with their scores g and information M, the coefficients have the mean t and the covariance V, and the
-estimates without them err by
+The displacements of the coefficients over the whole image, without what the orientation can do, have the root
+mean squares a, in pixels. The radial ones decay, a_j ~ N(0, (s q^j)²), the others (decentring, tilt, prism)
+have a size of their own. s, q and that size are as probable as they predict the estimates and the image
+points (the evidence; Bishop 2006, *Pattern Recognition and Machine Learning*, sect. 3.5). With the estimates
+x̂ of covariance C, which held coefficients θ change by K θ, and with their scores g and information M, the
+coefficients have the mean t and the covariance V, and the estimates without them err by
 
     [−K; I] (V + t tᵀ) [−K; I]ᵀ
 
 about the values that were estimated, and zero.
 
 Where the model was chosen, those of other kinds may be the right ones: model m is as probable as it predicts
-the images, and moves the coefficients by δ_m, which describe its mapping over the image best. To the mean
-squares, Σ P(m) δ_m δ_mᵀ is added (Draper 1995, *J. R. Statist. Soc.* B 57: the variance between models).
+the images, and moves the coefficients by δ_m, which describe its mapping best where points were seen. To the
+mean squares, Σ P(m) δ_m δ_mᵀ is added (Draper 1995, *J. R. Statist. Soc.* B 57: the variance between models);
+what no coefficients describe of m counts in the image, see
+:meth:`reseau.calibration.CameraMapping.by_models`.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ _ACROSS = 15
 _RADIAL, _OWN, _NONE = 1e-3, 0.01, 1e-9
 """Part of the square that is not radial in a radial term; part of a displacement that the terms before it do
 not have, as each power has a quarter of what the one before has; size that is none, by the largest."""
-_PLACES, _SHARE = 400, 0.05
-"""Image points at which models are compared; part of their difference that parameters need not describe."""
+_PLACES = 400
+"""Image points at which models are compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,19 +61,23 @@ class Considered:
         Their mean squares.
     by : ndarray (u, q)
         What one unit of each changes of the reduced unknowns, where it is held at zero.
-    between : ndarray (k + q, k + q)
-        Mean squares of the estimated parameters and of the coefficients by models of other kinds.
+    rivals : tuple of Rival
+        Models of other kinds, with what they change of the estimated parameters and of the coefficients.
     """
 
     names: tuple[str, ...]
     square: Array
     by: Array
-    between: Array
+    rivals: tuple[Rival, ...] = ()
 
     def errors(self, columns: Rows) -> Array:
         """Mean squares (k + q, k + q) of errors of the estimated parameters, and of the coefficients."""
         turn = np.concatenate([-self.by[columns], np.eye(len(self.names))])
-        return np.asarray(turn @ self.square @ turn.T + self.between)
+        total = turn @ self.square @ turn.T
+        for each in self.rivals:
+            assert each.moves is not None
+            total += each.probability * np.outer(each.moves, each.moves)
+        return np.asarray(total)
 
 
 def considered(
@@ -119,9 +124,9 @@ def considered(
     own = network.camera_of[network.image_of[used_rows(fit)]] == c
     x, y, z = in_camera(fit)[own].T
     uv = np.column_stack([x, y]) / (1.0 if mapping.parallel else z[:, None])
-    found = Considered((), np.zeros((0, 0)), np.zeros((fit.unknowns.size, 0)), np.zeros_like(covariance))
+    found = Considered((), np.zeros((0, 0)), np.zeros((fit.unknowns.size, 0)))
     if held:
-        terms, radial, kept = _terms(lens, model, np.concatenate([rows[at], held]).astype(np.intp), len(at))
+        size, radial, kept = _terms(lens, model, np.concatenate([rows[at], held]).astype(np.intp), len(at))
         held = [held[k] for k in kept]
     if held:
         slope = np.zeros((len(own), 2, len(held)))
@@ -135,51 +140,50 @@ def considered(
         known, side = turn.T @ inverse @ turn, turn.T @ inverse @ np.array(mapping.values)[rows[at]]
         known[len(at) :, len(at) :] += seen.m / noise
         side[len(at) :] += seen.g / noise
-        square = _mean_square(known, side, terms, radial, float(np.hypot(camera.width, camera.height)))
-        square, count = square[len(at) :, len(at) :], len(columns) + len(held)
+        square = _mean_square(known, side, size, radial, float(np.hypot(camera.width, camera.height)))
         names = tuple(camera.names[k] for k in held)
-        found = Considered(names, square, seen.carried, np.zeros((count, count)))
+        found = Considered(names, square[len(at) :, len(at) :], seen.carried)
     if not rivals:
         return found if held else None
     possible = found.errors(columns)
     possible[: len(columns), : len(columns)] += covariance
     some = uv[:: max(1, len(uv) // _PLACES)]
-    between = _between(lens, np.concatenate([rows, held]).astype(np.intp), some, rivals, possible)
-    return replace(found, between=between)
+    order = np.concatenate([rows, held]).astype(np.intp)
+    return replace(found, rivals=tuple(_described(each, lens, order, some, possible) for each in rivals))
 
 
-def _between(lens: CameraMapping, order: Rows, uv: Array, rivals: Sequence[Rival], possible: Array) -> Array:
-    """Mean squares of parameters in this order by models of other kinds, where points were seen.
+def _described(rival: Rival, lens: CameraMapping, order: Rows, uv: Array, possible: Array) -> Rival:
+    """A model of another kind, with the changes of parameters in this order that describe it best.
 
-    Of the changes of parameters that describe a model, those are taken that are most probable beside what is
-    possible of them: parameters which do the same are not played off against each other.
+    These are the most probable ones beside what is possible of the parameters, so that those which do the
+    same are not played off against each other; what none describes is as noise.
     """
-    found = np.zeros_like(possible)
     seen = lens.mapping.derivatives(uv)
-    turn = seen.d_xy @ by_rotation(uv, lens.mapping.parallel)
-    for rival in rivals:
-        off = rival.lens.mapping(uv) - seen.value
-        at = np.isfinite(off).all(axis=1)
-        if not at.any():
-            continue
-        both = np.concatenate([seen.d_parameters[at][:, :, order], off[at, :, None]], axis=2)
-        flat = referred(turn[at], both).reshape(2 * int(at.sum()), -1)
-        slope, left = flat[:, :-1], flat[:, -1]
-        weight = 1 / max(_SHARE**2 * float(left @ left) / len(left), _NONE**2)
+    off = rival.lens.mapping(uv) - seen.value
+    at = np.isfinite(off).all(axis=1)
+    moved, rotation = np.zeros(len(order)), np.zeros(3)
+    if at.any():
+        turn = (seen.d_xy @ by_rotation(uv, lens.mapping.parallel))[at]
+        slope = seen.d_parameters[at][:, :, order]
+        both = referred(turn, np.concatenate([slope, off[at, :, None]], axis=2)).reshape(2 * len(turn), -1)
+        by, left = both[:, :-1], both[:, -1]
         # (Jᵀ J w + C⁻¹)⁻¹ Jᵀ w, with the root of C, which may be singular.
         values, vectors = np.linalg.eigh(possible)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        half = slope @ root
+        half = by @ root
+        rest = left - half @ np.linalg.lstsq(half, left, rcond=None)[0]
+        weight = max(len(left) - len(root), 1) / max(float(rest @ rest), _NONE**2)
         moved = root @ np.linalg.solve(np.eye(len(root)) + weight * half.T @ half, weight * half.T @ left)
-        found += rival.probability * np.outer(moved, moved)
-    return found
+        whole = (off[at] - slope @ moved).ravel()
+        rotation = np.linalg.lstsq(turn.reshape(-1, 3), whole, rcond=None)[0]
+    return replace(rival, moves=moved, rotation=rotation)
 
 
 def _terms(lens: CameraMapping, model: CameraModel, order: Rows, free: int) -> tuple[Array, Mask, list[int]]:
     """Displacements over the image by coefficients in this order, of which the first ones are free.
 
-    Returns T (q, q), which terms are radial, and which of the others are terms of their own: denominators
-    of rational models write the powers before them in another way.
+    Returns their root mean squares (q,), px, which are radial, and which of the others are terms of their
+    own: denominators of rational models write the powers before them in another way.
     """
     xy, _ = places(lens, _ACROSS, None)
     uv = lens.mapping.inverse(xy)
@@ -194,19 +198,15 @@ def _terms(lens: CameraMapping, model: CameraModel, order: Rows, free: int) -> t
     beside = (np.einsum("gi,gik->gk", across, moved) ** 2).sum(axis=0)
     radial = beside < _RADIAL * (moved**2).sum(axis=(0, 1))
     flat = referred(oriented, slope).reshape(2 * len(uv), -1) / np.sqrt(max(len(uv), 1))
+    size = np.linalg.norm(flat, axis=0)
     # Radial terms first: what others have of them is theirs.
     place = np.argsort(~radial, kind="stable")
-    own = np.abs(np.diag(np.linalg.qr(flat[:, place], mode="r"))) > _OWN * np.linalg.norm(
-        flat[:, place], axis=0
-    )
-    place = place[own | (place < free)]
-    terms = np.zeros((len(place), len(place)))
-    new = np.argsort(np.argsort(place))
-    terms[:, new] = np.linalg.qr(flat[:, place], mode="r")
-    return terms, radial[place], (np.sort(place[place >= free]) - free).tolist()
+    own = np.abs(np.diag(np.linalg.qr(flat[:, place], mode="r"))) > _OWN * size[place]
+    place = np.sort(place[own | (place < free)])
+    return size[place], radial[place], (place[place >= free] - free).tolist()
 
 
-def _mean_square(known: Array, side: Array, terms: Array, radial: Mask, diagonal: float) -> Array:
+def _mean_square(known: Array, side: Array, sizes: Array, radial: Mask, diagonal: float) -> Array:
     """Mean squares of coefficients with this information, whatever the sizes of the terms (q, q)."""
     level = np.cumsum(radial) - 1
     decays = _DECAY if radial.sum() > 1 else _DECAY[:1]
@@ -214,8 +214,7 @@ def _mean_square(known: Array, side: Array, terms: Array, radial: Mask, diagonal
     others = _SIZES[:1] if radial.all() else _SIZES
     every = np.array(list(product(first, decays, others)))
     sigma = diagonal * np.where(radial, every[:, :1] * every[:, 1:2] ** level, every[:, 2:])
-    prior = np.einsum("jp,hj,jq->hpq", terms, sigma**-2, terms)
-    total = known + prior
+    total = known + np.eye(len(sizes)) * ((sizes / sigma) ** 2)[:, None, :]
     size = 1 / np.sqrt(np.einsum("hpp->hp", total))
     values, vectors = np.linalg.eigh(total * size[:, :, None] * size[:, None, :])
     values = np.maximum(values, _NONE**1.5 * values[:, -1:])

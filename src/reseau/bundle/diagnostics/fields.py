@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...calibration.camera import CameraMapping, ProjectionField, Rival, by_rotation, places, reach
+from ...calibration.rectification import Pair
 from ...core.data import Array, Rows
 from ...core.errors import UsageError
 from .checks import listed
@@ -54,6 +55,49 @@ def camera_mapping(
         rivals = result.rivals_of(c)
     size, plane = (camera.width, camera.height), camera.plane_mapping()
     return CameraMapping.of_estimates(plane, size, found, names, covariance, dof=degrees, rivals=rivals)
+
+
+def pair_of(result: Result, c: int) -> Pair:
+    """Return a camera and its reference on a rig, with their joint covariance.
+
+    Parameters
+    ----------
+    result : Result
+        The adjustment.
+    c : int
+        Row of a camera that has a place on the rig.
+
+    Raises
+    ------
+    UsageError
+        When it has none.
+    """
+    found, places = result.places_by_reduced, result.fit.values.rig
+    if found is None or places is None or c not in found[0]:
+        raise UsageError("has no place with respect to another camera", where=result.network.cameras[c].label)
+    k = int(np.flatnonzero(found[0] == c)[0])
+    by_place, every, share = found[2][k], (int(found[1][k]), c), 1.0
+    lenses, columns = [], []
+    for each in every:
+        lenses.append(camera_mapping(result, each))
+        columns.append(result.camera_columns(each)[1])
+        uncertain = result.uncertainty_of_points(columns[-1])
+        root = np.linalg.pinv(uncertain.formal, hermitian=True)
+        # As one variance: what the points of an image share makes both cameras and their places uncertain.
+        share = max(share, float(np.trace(root @ uncertain.covariance)) / max(len(root), 1))
+    starts, count = (0, len(lenses[0].rows)), sum(len(lens.rows) for lens in lenses)
+    by = np.zeros((count + 6, by_place.shape[1]))
+    by[count:] = by_place
+    for start, own in zip(starts, columns, strict=True):
+        by[start + np.arange(len(own)), own] = 1.0
+    covariance = share * result.fit.variance * by @ result.fit.cofactors.reduced.full @ by.T
+    for start, own, each in zip(starts, columns, every, strict=True):
+        held = result.considered.get(each)
+        if held is not None and held.names:
+            slope = -by @ held.by
+            slope[start + len(own) + np.arange(len(held.names))] = np.eye(len(held.names))
+            covariance += slope @ held.square @ slope.T
+    return Pair((lenses[0], lenses[1]), places.rotation[c], places.base[c], result.network.unit, covariance)
 
 
 def own_columns(result: Result, c: int, additional: str | None) -> tuple[tuple[str, ...], Rows, Array]:

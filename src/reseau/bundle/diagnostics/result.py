@@ -106,7 +106,8 @@ class Result(Estimated, Display):
         with all parameters and with the kept ones.
     rivals : tuple of tuple of Rival, optional
         Models of other kinds that each camera may have, where the model was chosen by these observations: the
-        covariances of cameras contain these, and what coefficients could do that were held at zero.
+        covariances of cameras contain these, and what coefficients could do that were held at zero. None of
+        a camera whose model was given.
     others : tuple of OtherSolution, optional
         Solutions that the observations allow as well, and standard deviations exclude: what differs has none.
 
@@ -130,7 +131,7 @@ class Result(Estimated, Display):
     components: VarianceComponents[BundleFit] | None = None
     eliminated: tuple[Eliminated, ...] | None = None
     validation: tuple[float, float] | None = None
-    rivals: tuple[tuple[Rival, ...], ...] | None = None
+    rivals: tuple[tuple[Rival, ...] | None, ...] | None = None
     others: tuple[OtherSolution, ...] = ()
 
     @property
@@ -285,19 +286,20 @@ class Result(Estimated, Display):
         It contains what the points of each image have in common and, where the model was chosen, what
         coefficients could do that were not estimated.
         """
-        found = self._shared_uncertainty(columns)
-        more = [each.errors(columns)[: len(columns), : len(columns)] for each in self._considered.values()]
+        found = self.uncertainty_of_points(columns)
+        more = [each.errors(columns)[: len(columns), : len(columns)] for each in self.considered.values()]
         return found if not more else found.with_errors(np.sum(more, axis=0))
 
     def rivals_of(self, c: int) -> tuple[Rival, ...]:
         """Models of other kinds that a camera may have."""
-        return self.rivals[c] if self.rivals else ()
+        own = self.considered.get(c)
+        return own.rivals if own is not None else (self.rivals[c] or ()) if self.rivals else ()
 
     def with_considered(
         self, c: int, names: tuple[str, ...], columns: Rows, covariance: Array
     ) -> tuple[tuple[str, ...], Array, Array | None]:
         """Names and covariance of a camera's parameters with coefficients that were held, and their part."""
-        k, own = len(columns), self._considered.get(c)
+        k, own = len(columns), self.considered.get(c)
         if own is None:
             return names, covariance, None
         part = own.errors(columns)
@@ -306,17 +308,19 @@ class Result(Estimated, Display):
         return (*names, *own.names), total, part
 
     @cached_property
-    def _considered(self) -> dict[int, Considered]:
+    def considered(self) -> dict[int, Considered]:
         """Coefficients of each camera that were held at zero, where some were."""
         found = dict[int, Considered]()
         for c, rivals in enumerate(self.rivals or ()):
+            if rivals is None:
+                continue
             columns = self.camera_columns(c)[1]
-            own = considered(self.fit, c, columns, self._shared_uncertainty(columns).covariance, rivals)
+            own = considered(self.fit, c, columns, self.uncertainty_of_points(columns).covariance, rivals)
             if own is not None:
                 found[c] = own
         return found
 
-    def _shared_uncertainty(self, columns: Rows) -> Uncertainty:
+    def uncertainty_of_points(self, columns: Rows) -> Uncertainty:
         """The covariance that contains what the points of each image have in common."""
         if self.shared is not None and len(columns):
             return self.shared.uncertainty(columns)
@@ -392,17 +396,25 @@ class Result(Estimated, Display):
     @one_thread()
     def rig(self) -> RigEstimate | None:
         """Relative orientations of the cameras of a rig; None without one."""
+        found = self.places_by_reduced
+        places = self.fit.values.rig
+        if found is None or places is None:
+            return None
+        (at, references, by), names = found, [camera.id for camera in self.network.cameras]
+        cov = by @ self.fit.cofactors.reduced.full @ np.swapaxes(by, 1, 2) * self.fit.variance
+        cameras, first = (tuple(names[k] for k in rows) for rows in (at, references))
+        return RigEstimate(cameras, first, places.rotation[at], places.base[at], cov, self.network.unit)
+
+    @cached_property
+    def places_by_reduced(self) -> tuple[Rows, Rows, Array] | None:
+        """Cameras (k,) with places on a rig, their references, and derivatives of rotation and base (k, 6, u)
+        by the reduced unknowns."""
         linear, places = self.fit.linear, self.fit.values.rig
         constraints = None if linear.system.constraints is None else linear.system.constraints.rig
         if constraints is None or places is None:
             return None
-        at, names = constraints.cameras, [camera.id for camera in self.network.cameras]
         t = constraints.matrix(places, linear.values.rotation, linear.values.x0)
-        cofactors = constraints.cofactors(t, self.fit.cofactors.reduced.full)
-        each = np.arange(len(at))
-        cameras, references = (tuple(names[k] for k in rows) for rows in (at, constraints.references[at]))
-        cov = cofactors[each, :, each] * self.fit.variance
-        return RigEstimate(cameras, references, places.rotation[at], places.base[at], cov, self.network.unit)
+        return constraints.cameras, constraints.references[constraints.cameras], constraints.by_reduced(t)
 
     @cached_property
     def stage(self) -> StageEstimate | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -72,6 +73,12 @@ class Candidate:
         more = [name for name in self.free if name not in plain]
         more += [] if self.additional is None else [self.additional]
         return f"{self.model}: {' '.join(more) or 'no distortion'}"
+
+    @classmethod
+    def of(cls, camera: Camera) -> Self:
+        """The candidate that describes a camera."""
+        extra = None if camera.additional is None else camera.additional.model
+        return cls(camera.model, camera.free, camera.options, extra)
 
     def within(self, other: Candidate) -> bool:
         """Whether it is the other candidate without some of its parameters."""

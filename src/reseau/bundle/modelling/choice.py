@@ -11,7 +11,7 @@ would predict it with any camera.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -231,7 +231,10 @@ def choose_model(
 
 
 def choose_models(
-    network: Network, candidates: Sequence[Candidate] | None = None, options: Options | None = None
+    network: Network,
+    candidates: Sequence[Candidate] | None = None,
+    options: Options | None = None,
+    known: Collection[int] = (),
 ) -> tuple[ModelChoice, ...] | Failure:
     """Choose the model of each camera of a network: its kind from its own images, its parameters from all.
 
@@ -239,6 +242,8 @@ def choose_models(
     ----------
     network, candidates, options
         See :func:`choose_model`; cameras may be fixed to each other.
+    known : collection of int
+        Rows of cameras that have the model that they have.
 
     Returns
     -------
@@ -257,8 +262,10 @@ def choose_models(
     ['brown: K1']
     """
     options, chosen = options or Options(), list[_Search]()
-    for camera in network.cameras:
-        if camera.additional is not None or camera.sigma or camera.covariance is not None:
+    for c, camera in enumerate(network.cameras):
+        if c not in known and (
+            camera.additional is not None or camera.sigma or camera.covariance is not None
+        ):
             raise UsageError(
                 "has additional or observed parameters", where=f"{camera.label}, choice of a model"
             )
@@ -266,7 +273,8 @@ def choose_models(
         raise UsageError("there are none", where="candidates of the choice of a model")
     network = _sampled(network)
     for c in range(len(network.cameras)):
-        found = _alone(network, c, candidates, options)
+        own = [Candidate.of(network.cameras[c])] if c in known else candidates
+        found = _alone(network, c, own, options)
         if isinstance(found, Failure):
             return found
         chosen.append(found)

@@ -221,15 +221,16 @@ class RigConstraints:
             names += [f"{name} of {cameras[camera]} on the rig" for name in own]
         return tuple(names)
 
-    def cofactors(self, t: Array, reduced: Array) -> Array:
-        """Cofactors (k, 6, k, 6) of the places of the cameras, from those of the reduced unknowns (u, u).
+    def by_reduced(self, t: Array) -> Array:
+        """Derivatives (k, 6, u) of the places of the cameras by the reduced unknowns.
 
         Rotations are about the axes of the camera, centres in those of the rig.
         """
         rows, count = self._rows.ravel(), len(self.cameras)
         back = np.linalg.pinv(t[rows][:, len(self.others) :])
-        back = back[len(back) - 6 * count :]
-        return np.asarray(back @ reduced[np.ix_(rows, rows)] @ back.T).reshape(count, 6, count, 6)
+        found = np.zeros((count, 6, len(t)))
+        found[:, :, rows] = back[len(back) - 6 * count :].reshape(count, 6, len(rows))
+        return found
 
 
 class Constrained(NamedTuple):

@@ -1,12 +1,19 @@
-"""A line of COLMAP's ``cameras.txt``. COLMAP counts pixels from the corner of the first one: + 0.5."""
+"""A line of COLMAP's ``cameras.txt``, and its ``rig_config.json``.
+
+COLMAP counts pixels from the corner of the first one: + 0.5.
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ...bundle import Camera
 from ...core.errors import FormatError
-from .plain import CENTRE, FISHEYE, RADIAL_TANGENTIAL, RATIONAL, opencv_camera
+from ...optics.poses import quaternions
+from .plain import CENTRE, FISHEYE, RADIAL_TANGENTIAL, RATIONAL, Mounted, opencv_camera
 
 # Models with their parameters, in the order of COLMAP's numbers.
 MODELS: dict[str, tuple[str, ...]] = {
@@ -24,6 +31,29 @@ MODELS: dict[str, tuple[str, ...]] = {
 
 def write(camera: Camera) -> str:
     """Return the text of a ``cameras.txt`` with one camera, in the smallest model that holds it."""
+    model, values = _model_of(camera)
+    head = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+    return f"{head}1 {model} {camera.width} {camera.height} {' '.join(map(repr, values))}\n"
+
+
+def write_rig(rig: Sequence[Mounted]) -> str:
+    """Return the text of a ``rig_config.json``: images of each camera are in a folder of its name; m."""
+    cameras = []
+    for k, mounted in enumerate(rig):
+        model, values = _model_of(mounted.camera)
+        place: dict[str, Any] = {"ref_sensor": True}
+        if k:
+            place = {
+                "cam_from_rig_rotation": quaternions(mounted.rotation[None])[0].tolist(),
+                "cam_from_rig_translation": (1e-3 * mounted.translation).tolist(),
+            }
+        given = {"camera_model_name": model, "camera_params": values}
+        cameras.append({"image_prefix": f"{mounted.camera.id}/"} | place | given)
+    return json.dumps([{"cameras": cameras}], indent=2) + "\n"
+
+
+def _model_of(camera: Camera) -> tuple[str, list[float]]:
+    """The smallest model that holds a camera, and its numbers."""
     given = {name: value for name, value in camera.parameters.items() if value}
     if given.get("fx") == given.get("fy"):
         given["f"] = given.get("fx", 0.0)
@@ -36,9 +66,7 @@ def write(camera: Camera) -> str:
         and (names[0] == "fx" or "f" in given)
     )
     model, names = min(holding, key=lambda each: len(each[1]))
-    values = [given.get(name, 0.0) + 0.5 * (name in ("cx", "cy")) for name in names]
-    head = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
-    return f"{head}1 {model} {camera.width} {camera.height} {' '.join(map(repr, values))}\n"
+    return model, [given.get(name, 0.0) + 0.5 * (name in ("cx", "cy")) for name in names]
 
 
 def recognises(text: str) -> bool:

@@ -71,6 +71,8 @@ class CalibrationFormat:
         Sides of Brown's distortion that it holds, the usual one first.
     square : bool
         Whether pixels are square.
+    rig : callable, optional
+        Text of the file of cameras that are fixed to each other.
 
     Examples
     --------
@@ -89,6 +91,7 @@ class CalibrationFormat:
     sides: tuple[str, ...] = ("image",)
     square: bool = False
     comment: Literal["", "#", "%", "after the head"] = ""
+    rig: Callable[[Sequence[Mounted]], str] | None = None
 
 
 def calibration_formats() -> dict[str, CalibrationFormat]:
@@ -105,7 +108,7 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
         CalibrationFormat(
             "opencv", (".yml", ".yaml", ".xml", ".json"),
             (*wide, ("opencv_full", _TWELVE), ("opencv_full", (*CENTRE, *TILTED)), fisheye),
-            opencv.write, opencv.recognises, opencv.read, comment="after the head",
+            opencv.write, opencv.recognises, opencv.read, comment="after the head", rig=opencv.write_pair,
         ),
         CalibrationFormat(
             "ros", (".yaml",), (*wide, fisheye), yamls.write_ros, yamls.is_ros, yamls.read_ros,
@@ -115,7 +118,7 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
             "kalibr", (".yaml",),
             (("opencv", _RADTAN), fisheye, ("omni", (*_RADTAN, "xi")),
              *spheres),
-            yamls.write_kalibr, yamls.is_kalibr, yamls.read_kalibr, comment="#",
+            yamls.write_kalibr, yamls.is_kalibr, yamls.read_kalibr, comment="#", rig=yamls.write_kalibr_rig,
         ),
         CalibrationFormat(
             "basalt", (".json",), (("opencv", _EIGHT), fisheye, *spheres),
@@ -123,7 +126,7 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
         ),
         CalibrationFormat(
             "colmap", (".txt",), (("opencv", _RADTAN), ("opencv", _EIGHT), fisheye),
-            colmap.write, colmap.recognises, colmap.read, comment="#",
+            colmap.write, colmap.recognises, colmap.read, comment="#", rig=colmap.write_rig,
         ),
         CalibrationFormat(
             "mrcal", (".cameramodel",),
@@ -295,9 +298,9 @@ def export_rig(
     calibrations : sequence of Calibration
         One of them is the reference, all others have a `place` with respect to it.
     to : str
-        ``opencv``, for two cameras, or ``kalibr``.
+        ``opencv``, for two cameras, ``kalibr``, or ``colmap``: a ``rig_config.json``.
     path : path
-        File to write; OpenCV's translation is in mm, Kalibr's in m.
+        File to write; OpenCV's translation is in mm, those of Kalibr and COLMAP are in m.
     anyway : bool
         Whether to go on with a calibration that is usable for nothing.
 
@@ -321,8 +324,11 @@ def export_rig(
     ...
     reseau.core.errors.UsageError: calibrations: are not those of one rig: 0 have no place; give ...
     """
-    if to not in ("opencv", "kalibr"):
-        raise UsageError("has no cameras that are fixed to each other; use opencv or kalibr", where=to)
+    formats = calibration_formats()
+    form = formats.get(to)
+    if form is None or form.rig is None:
+        known = ", ".join(name for name, each in formats.items() if each.rig is not None)
+        raise UsageError(f"has no cameras that are fixed to each other; use {known}", where=to)
     first = [each for each in calibrations if each.place is None]
     placed = [each for each in calibrations if each.place is not None]
     units = {each.place.unit for each in placed if each.place is not None}
@@ -333,10 +339,8 @@ def export_rig(
         )  # fmt: skip
     if units != {"mm"}:
         raise UsageError(f"have places in {', '.join(sorted(units))}, not in mm", where="calibrations")
-    if to == "opencv" and len(placed) > 1:
-        raise UsageError("holds two cameras", where=to, do="use kalibr, or write pairs")
     notes = _notes(calibrations, anyway)
-    form, done, rig = calibration_formats()[to], list[Exported](), list[Mounted]()
+    done, rig = list[Exported](), list[Mounted]()
     for each in (*first, *placed):
         lens = each.mapping()
         if not isinstance(lens, CameraMapping):
@@ -345,8 +349,8 @@ def export_rig(
         place = each.place
         turn = np.eye(3) if place is None else rotation_matrix(np.array(place.rotation))
         rig.append(Mounted(done[-1].camera, turn, np.zeros(3) if place is None else np.array(place.base)))
-    text = opencv.write_pair(rig[0], rig[1]) if to == "opencv" else yamls.write_kalibr_rig(rig)
-    write_whole(Path(path), _commented(form, text, calibrations))
+    text = form.rig(rig)
+    write_whole(Path(path), text if text.startswith("[") else _commented(form, text, calibrations))
     return (done[0]._replace(notes=notes), *done[1:])
 
 

@@ -7,6 +7,7 @@ counted from the centre of the first one, as here.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 
 from ...bundle import Camera
-from ...core.errors import FormatError
+from ...core.errors import FormatError, UsageError
 from ...optics.cameras.opencv import opencv_coefficients
 from .plain import CENTRE, FISHEYE, Mounted, given, opencv_camera
 
@@ -32,11 +33,19 @@ def write(camera: Camera) -> str:
     return storage.releaseAndGetString()
 
 
-def write_pair(left: Mounted, right: Mounted) -> str:
+def write_pair(rig: Sequence[Mounted]) -> str:
     """Return the text of a YAML file with the keys of OpenCV's sample of stereo calibration.
 
     A point of the left camera is x' = R x + T in the right one, mm.
+
+    Raises
+    ------
+    UsageError
+        When there are more than two cameras.
     """
+    if len(rig) > 2:
+        raise UsageError("holds two cameras", where="opencv", do="use kalibr or colmap, or write pairs")
+    left, right = rig
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", left.camera.width)
     storage.write("image_height", left.camera.height)
