@@ -82,6 +82,7 @@ ENTRIES = (
     Entry("calibrations", "Calibrations of the same corners", "cameras.py --part calibrations",
           ("OpenCV", "mrcal", "COLMAP"), "chessboard_stereo"),
     Entry("degenerate", "Networks of a camera that only turned, or nearly", "degenerate.py --count 200"),
+    Entry("critical", "Networks with several solutions, or nearly", "critical.py --count 100"),
     Entry("causes", "Causes of misfit that are named", "causes.py --sound 100"),
     Entry("intervals", "Intervals with errors that images have in common",
           "intervals.py --seeds 40 --images 6 20"),
@@ -130,8 +131,8 @@ ENTRIES = (
 
 SUBJECTS = {
     "peers-cameras": ("Cameras and networks, beside peers", (
-        "bundle", "cameras", "calibrations", "degenerate", "causes", "intervals", "halves", "model-choice",
-        "next-photograph", "stereo", "refraction", "water", "nist")),
+        "bundle", "cameras", "calibrations", "degenerate", "critical", "causes", "intervals", "halves",
+        "model-choice", "next-photograph", "stereo", "refraction", "water", "nist")),
     "peers-targets": ("Targets and boards, beside peers", (
         "disks", "testfield", "boards", "other-boards", "drawn-boards", "reseau-simulated", "reseau",
         "edges", "blurred", "rays")),

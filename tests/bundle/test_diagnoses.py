@@ -722,3 +722,18 @@ def test_control_on_a_line_is_named() -> None:
     xyz[:6] = line
     _, codes = said(replace(network, xyz=xyz, xy=xy), "keep")
     assert Code.COLLINEAR in codes
+
+
+@pytest.mark.parametrize(("wrong", "code"), [(True, Code.SIGMAS_DOUBTFUL), (False, Code.GROSS_ERRORS)])
+def test_standard_deviations_of_x_and_y_compete_with_gross_errors(wrong: bool, code: Code) -> None:
+    """Standard deviations in x that are too small by a hundred, or right ones and some gross errors in x."""
+    network, rng = networks.world(images=8, points=40, control=6, seed=3).noisy(1), np.random.default_rng(0)
+    xy, cov = network.xy.copy(), network.cov * [[1e-4, 1e-2], [1e-2, 1.0]]
+    if not wrong:
+        cov = network.cov * [[1.0, 10.0], [10.0, 100.0]]
+        xy[:, 1] += 0.5 * rng.normal(size=len(xy))
+        xy[::30, 0] += 3.0
+    result = adjust_network(replace(network, xy=xy, cov=cov)).required()
+    codes = [remark.code for remark in result.warnings]
+    assert codes[0] is code
+    assert (Code.GROSS_ERRORS in codes) is not wrong

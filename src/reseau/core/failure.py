@@ -40,7 +40,8 @@ class Code(StrEnum):
     AMBIGUOUS = (
         "ambiguous",
         "several solutions fit equally well",
-        "add something that distinguishes them: a coded mark, an approximate position, a limit of rotation",
+        "add something that distinguishes them: a coded mark, an approximate position, a limit of rotation; "
+        "in a network control points, distances, or images from other places",
     )
     BLURRED = (
         "blurred",

@@ -207,7 +207,8 @@ def _summary(result: Result) -> list[tuple[str, str, str]]:
     observations, unknowns, _ = result.fit.counts
     test, unit = result.global_test(), result.network.unit
     part = result.fit.usable.points & ~result.network.held.all(axis=1)
-    sigma = np.median(np.linalg.norm(result.point_sigma[part], axis=1)) if part.any() else np.nan
+    sigmas = np.linalg.norm(result.point_sigma[part], axis=1)
+    sigma = np.nanmedian(sigmas) if np.isfinite(sigmas).any() else np.nan
     verdict = "not tested" if test is None else "passed" if test.passed else "not passed"
     return [
         (f"{result.sigma0:.4g}", "", f"σ₀ a posteriori; global test {verdict}"),

@@ -59,6 +59,7 @@ def network_figure(result: Result) -> str:
 
 def _ellipses(axes: Axes, result: Result, points: Rows, plane: tuple[int, int], size: float) -> float:
     """Draw standard ellipses of some points; return the factor of enlargement."""
+    points = points[np.isfinite(result.point_sigma[points]).all(axis=1)]
     some = points[:: max(1, len(points) // _ELLIPSES)]
     q = result.point_covariance[some][:, plane][:, :, plane]
     axis = np.sqrt(np.maximum(np.linalg.eigvalsh(q)[:, 1], 0.0))

@@ -171,6 +171,7 @@ def checks(result: Result) -> list[Remark]:
     """
     network, fit = result.network, result.fit
     return [
+        *_several(result),
         *_too_near(result),
         *_without_perspective(result),
         *_gaps(result),
@@ -362,8 +363,8 @@ def _known_to(name: str, value: float, size: float) -> float:
 def _weak(result: Result) -> list[Remark]:
     """Points with much larger standard deviations than the others."""
     network = result.network
-    free = result.fit.usable.points & ~network.held.all(axis=1)
     sigma = np.sqrt((result.point_sigma**2).sum(axis=1))
+    free = np.isfinite(sigma) & ~network.held.all(axis=1)
     if not free.any():
         return []
     median = float(np.median(sigma[free]))
@@ -502,6 +503,42 @@ def _parallel(network: Network, fit: BundleFit) -> list[Remark]:
         )
         found.append(Remark(text, Code.NOT_IDENTIFIED))
     return found
+
+
+def _several(result: Result) -> list[Remark]:
+    """Other solutions that the observations allow, and how much they differ."""
+    network, fit, unknowns = result.network, result.fit, result.fit.unknowns
+    if not result.others:
+        return []
+    turned, moved = np.zeros(len(network.images)), np.zeros(len(network.points))
+    for other in result.others:
+        change, points = other.change(fit)
+        angle = np.linalg.norm(change[unknowns.pose[:, None] + np.arange(3)], axis=1)
+        turned = np.maximum(turned, np.where(unknowns.pose >= 0, np.degrees(angle), 0.0))
+        moved = np.fmax(moved, np.linalg.norm(points, axis=1))
+    i, j = int(np.argmax(turned)), int(np.argmax(moved))
+    extent = np.linalg.norm(np.std(fit.values.xyz[fit.usable.points], axis=0))
+    free = "scale" in fit.freedom.names
+    by = f"{100 * moved[j] / extent:.2g} % of their extent" if free else f"{moved[j]:.2g} {network.unit}"
+    said = [
+        *([f"image {network.images[i]} is turned by up to {turned[i]:.2g} deg"] * bool(turned[i])),
+        *([f"point {network.points[j]} is up to {by} away"] * bool(moved[j])),
+        *(
+            unknowns.names[k]
+            for k in np.flatnonzero(result.in_doubt[0])
+            if " of camera " in unknowns.names[k]
+        ),
+    ]
+    most = max(0.0, *(other.excess for other in result.others))
+    return [
+        Remark(
+            f"other solutions explain the observations as well (vᵀPv larger by at most {most:.2g} σ0²): "
+            f"{listed(said)} in them. What differs has no standard deviation. Points near a quadric "
+            "through the projection centres, points in a plane and few control points leave this open: add "
+            "control points, distances, or images from other places",
+            Code.AMBIGUOUS,
+        )
+    ]
 
 
 def _without_perspective(result: Result) -> list[Remark]:

@@ -37,6 +37,7 @@ from .estimates import (
     StageEstimate,
 )
 from .evidence import ODDS
+from .other_solutions import OtherSolution, excluded
 from .shared import SharedErrors, Uncertainty, shared_errors
 
 if TYPE_CHECKING:
@@ -107,6 +108,8 @@ class Result(Estimated, Display):
         Models of other kinds that each camera may have, where the model was chosen by these observations: the
         covariances of cameras contain these, and what coefficients could do that were held at zero. None of
         a camera whose model was given.
+    others : tuple of OtherSolution, optional
+        Solutions that the observations allow as well, and standard deviations exclude: what differs has none.
 
     Examples
     --------
@@ -129,6 +132,7 @@ class Result(Estimated, Display):
     eliminated: tuple[Eliminated, ...] | None = None
     validation: tuple[float, float] | None = None
     rivals: tuple[tuple[Rival, ...] | None, ...] | None = None
+    others: tuple[OtherSolution, ...] = ()
 
     @property
     def sigma0(self) -> float:
@@ -236,6 +240,8 @@ class Result(Estimated, Display):
         if not self.perspective(c)[1]:
             scale = np.isin(names, entry.registered.of_role("scale") if entry.registered else ())
             covariance = np.where(scale[:, None] | scale, np.nan, covariance)
+        doubt = self.in_doubt[0][columns]
+        covariance = np.where(doubt[:, None] | doubt, np.nan, covariance)
         return CameraEstimate(entry.id, names, values, covariance, units, formal=found.formal, dof=found.dof)
 
     def perspective(self, c: int) -> tuple[float, bool]:
@@ -263,6 +269,11 @@ class Result(Estimated, Display):
         """Images whose distances are not determined, as the focal length of their camera is not (m,)."""
         cameras = [not self.perspective(c)[1] for c in range(len(self.network.cameras))]
         return np.array(cameras, dtype=bool)[self.network.camera_of]
+
+    @cached_property
+    def in_doubt(self) -> tuple[Mask, Mask]:
+        """Reduced unknowns (u,) and points (p,) in which other solutions differ beyond their deviations."""
+        return excluded(self.fit, self.others)
 
     @cached_property
     def shared(self) -> SharedErrors | None:
@@ -594,6 +605,7 @@ class Result(Estimated, Display):
             # Remove jumps of an angle at ±π.
             turn[:, :3, axis] = ((change + np.pi) % (2 * np.pi) - np.pi) / (2 * _STEP)
         full = np.full((len(unknowns.pose), 6, 6), np.nan)
+        block[self.in_doubt[0][at].any(axis=1)] = np.nan
         full[images] = turn @ block @ np.swapaxes(turn, 1, 2)
         return full
 
@@ -601,8 +613,8 @@ class Result(Estimated, Display):
 
     @cached_property
     def point_covariance(self) -> Array:
-        """Covariances (p, 3, 3) of the points; zero for held coordinates, NaN for undetermined points."""
-        part = self.fit.usable.points[:, None, None]
+        """Covariances (p, 3, 3) of the points; zero for held coordinates, NaN where not determined."""
+        part = (self.fit.usable.points & ~self.in_doubt[1])[:, None, None]
         return np.where(part, self.fit.cofactors.points * self.fit.variance, np.nan)
 
     @cached_property
@@ -656,6 +668,8 @@ class Result(Estimated, Display):
                 raise UsageError("is not an estimated unknown", where=name)
         joint = self.fit.cofactors.joint(np.array(columns, dtype=np.intp), np.array(points, dtype=np.intp))
         at = [len(columns) + 3 * k + axis if of_point else k for of_point, k, axis in places]
+        doubt = np.concatenate([self.in_doubt[0][columns], np.repeat(self.in_doubt[1][points], 3)])
+        joint[doubt], joint[:, doubt] = np.nan, np.nan
         return joint[np.ix_(at, at)] * self.fit.variance
 
     # -- observations

@@ -242,6 +242,52 @@ def doubtful_parameters(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
     ]
 
 
+def uneven_axes(problem: BundleProblem, gross: Rows) -> list[Remark]:
+    """Find standard deviations of x and y that are wrong: equal ones explain more than gross errors do.
+
+    Two explanations of all image points are compared: the given standard deviations, with gross errors that
+    are anywhere in their images, and those of the less precise axis for both, times an unknown factor.
+
+    Parameters
+    ----------
+    problem : BundleProblem
+        The problem.
+    gross : ndarray of int
+        Image points that would be gross errors.
+    """
+    network, every = problem.network, np.arange(len(problem.network.xy))
+    size = np.sqrt(np.diagonal(network.cov, axis1=1, axis2=2))
+    even = size.max(axis=1)[:, None, None] ** 2 * np.eye(2)
+    times = float((size.max(axis=1) / size.min(axis=1)).max())
+    if np.allclose(network.cov, even, rtol=1e-6, atol=0.0):
+        return []
+    fit = replace(problem, network=replace(network, cov=even), rounds=0).adjusted()
+    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+    weights[2 * gross], weights[2 * gross + 1] = 0.0, 0.0
+    without = problem.with_weights(weights).adjusted()
+    camera = network.camera_of[network.image_of[gross]]
+    area = np.array([entry.width * entry.height for entry in network.cameras])[camera]
+    given = _log_likelihood(without, np.setdiff1d(every, gross)) - float(np.log(area).sum())
+    if isinstance(fit, Failure) or not _log_likelihood(fit, every) > given + ODDS:
+        return []
+    return [
+        Remark(
+            f"standard deviations of x and y differ by up to {times:.3g} times: with the larger for both, "
+            f"{len(gross)} image points that would be gross errors agree with the others (sigma0 "
+            f"{fit.sigma0:.3g}). The standard deviations are wrong, not the image points: give others",
+            Code.SIGMAS_DOUBTFUL,
+        )
+    ]
+
+
+def _log_likelihood(fit: BundleFit | Failure, rows: Rows) -> float:
+    """Logarithm of the likelihood of image points, with the variance factor that is most probable."""
+    if isinstance(fit, Failure) or not fit.sigma0 > 0:
+        return -np.inf
+    spread = fit.sigma0**2 * fit.problem.network.cov[rows]
+    return float(-np.linalg.slogdet(2 * np.pi * spread)[1].sum() / 2 - fit.redundancy / 2)
+
+
 def _freed(camera: Camera, *, usual: bool) -> Camera:
     """The camera with its usual or all parameters estimated; as it is, where they are already."""
     model = camera.registered

@@ -32,7 +32,13 @@ from ..diagnostics.control_check import (
 )
 from ..diagnostics.result import Result
 from ..diagnostics.stage_check import checked_readings, without_readings
-from ..diagnostics.suspects import contradicting, doubtful_parameters, grouped, without_false_bars
+from ..diagnostics.suspects import (
+    contradicting,
+    doubtful_parameters,
+    grouped,
+    uneven_axes,
+    without_false_bars,
+)
 from ..network.network import Network, finite
 from ..network.rig import RigValues
 from ..network.stage import Stage
@@ -42,6 +48,7 @@ from ..solver.problem import LAST_ROUND, BundleFit, BundleProblem
 from ..solver.unknowns import Unknowns
 from ..solver.values import Values
 from .one_station import one_station
+from .other_starts import compared
 from .rejection import MANY, bent_plane, many_rejected, suspects, without_gross_errors
 from .startup import RETRIED, adjusted_in_steps, lost_images, settled
 
@@ -310,16 +317,23 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         _, of_control = (None, []) if grave else _control(problem, fit)
     n = len(network.xy)
     rejected = np.asarray(fit.rejected[: 2 * n].reshape(n, 2).any(axis=1))
+    fit, others = (fit, ()) if grave else compared(fit)
     without_depth = None if grave else one_station(problem, fit)
     if without_depth is not None:
         return without_depth
-    bare = Result(network, fit, rejected, steps)
+    bare = Result(network, fit, rejected, steps, others=others)
     if not grave:
         found += _doubts(problem, fit, of_control, given)
         found += [] if of_control else _rejected_control(network, rejected)
         found += _frontal(network, bare)
     found += many_rejected(network, rejected)
-    return Result(network, fit, rejected, steps, (*found, *notes, *checks(bare)))
+    return replace(bare, warnings=(*found, *notes, *_checked(bare, found)))
+
+
+def _checked(result: Result, found: list[Remark]) -> list[Remark]:
+    """What checks find; no gross errors where the standard deviations of an axis make them."""
+    wrong = any(remark.code is Code.SIGMAS_DOUBTFUL for remark in found)
+    return [each for each in checks(result) if not (wrong and each.code is Code.GROSS_ERRORS)]
 
 
 def _without_statistics(problem: BundleProblem) -> Remark:
@@ -520,6 +534,10 @@ def _doubts(
         tie: Mask = np.asarray(np.isnan(problem.network.sigma).any(axis=1))[problem.network.point_of]
         rows = suspects(problem) if not of_control or tie.any() else np.zeros(0, dtype=np.intp)
         rows = rows[tie[rows]] if of_control else rows
+        uneven = uneven_axes(problem, rows) if len(rows) else []
+        if uneven:
+            # What else contradicts does so by these weights.
+            return uneven
         if len(rows) and not held:
             doubts += [*grouped(problem.network, rows), _gross(problem.network, rows)]
     return doubts
@@ -604,7 +622,7 @@ def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) ->
             share = 100 * len(rows) / max(len(network.xy), 1)
             said = f"{len(rows)} of {len(network.xy)} image points ({share:.0f} %) contradict the others"
             first = Remark(f"{said}: reject them (`--reject`)", Code.GROSS_ERRORS)
-            found = [first, *grouped(network, rows), _gross(network, rows)]
+            found = uneven_axes(problem, rows) or [first, *grouped(network, rows), _gross(network, rows)]
         elif failure.code in (Code.NOT_CONVERGED, Code.NOT_FINITE):
             found = _worst_images(network, _misfits_px(problem))
     if not found:

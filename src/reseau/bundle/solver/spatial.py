@@ -186,15 +186,15 @@ def resect(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
         None where no pose pays for its six parameters; see :class:`~reseau.adjust.mixture.Mixture`.
     """
     # In a plane across the middle of the rays misfits are angles, even in the corners of a wide lens.
-    turn = _towards(uv)
+    turn = towards(uv)
     ray = np.column_stack([uv, np.ones(len(uv))]) @ turn.T
-    front = ray[:, 2] > _GRAZING * np.linalg.norm(ray, axis=1)
+    front = ~beside(ray)
     if front.sum() < 4:
         return None
     uv, given, xyz = ray[front, :2] / ray[front, 2:], len(xyz), xyz[front]
     centre = xyz.mean(axis=0)
     size = float(np.abs(xyz - centre).max()) or 1.0
-    search = _Poses(
+    search = Poses(
         np.ascontiguousarray((xyz - centre) / size), np.ascontiguousarray(uv), field_of(uv), tolerance
     )
     try:
@@ -209,7 +209,12 @@ def resect(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
     return Resection(turn.T @ rotation, centre - size * rotation.T @ shift, agree)
 
 
-def _towards(uv: Array) -> Array:
+def beside(ray: Array) -> Mask:
+    """Rays (k,) that are nearly in the plane across the middle of all, or behind it."""
+    return np.asarray(ray[:, 2] <= _GRAZING * np.linalg.norm(ray, axis=1))
+
+
+def towards(uv: Array) -> Array:
     """Rotation (3, 3) that turns the mean of the rays to the optical axis."""
     ray = np.column_stack([uv, np.ones(len(uv))])
     z = (ray / np.linalg.norm(ray, axis=1, keepdims=True)).mean(axis=0)
@@ -280,7 +285,7 @@ def resect_through(
     return Resection(rotation, x0, agree)
 
 
-class _Poses(NamedTuple):
+class Poses(NamedTuple):
     """Poses of an image from three of its points, judged by all: points (k, 3), directions, their extent."""
 
     xyz: Array
@@ -309,7 +314,7 @@ class _Poses(NamedTuple):
         done, wanted = 0, float(_TRIALS[0])
         while done < wanted:
             three = np.argsort(rng.random((_TRIALS[0], k)), axis=1)[:, :3] if k > 3 else np.arange(3)[None]
-            poses = np.concatenate([poses, *(self._of_three(rows) for rows in three)])
+            poses = np.concatenate([poses, *(self.of_three(rows) for rows in three)])
             done += len(three)
             poses = poses[np.isfinite(poses).all(axis=1)]
             if not len(poses):
@@ -334,7 +339,7 @@ class _Poses(NamedTuple):
         )
         return self._poses(found)
 
-    def _of_three(self, rows: Rows) -> Array:
+    def of_three(self, rows: Rows) -> Array:
         """Poses (h, 6) from three points."""
         _, *found = cv2.solveP3P(self.xyz[rows], self.uv[rows], np.eye(3), np.zeros(0), cv2.SOLVEPNP_AP3P)
         return self._poses(found)
