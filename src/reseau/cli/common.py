@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from ..core import vocabulary as v
-from ..core.data import twice
 from ..core.errors import EstimationError, UsageError
 from ..core.files import made_folder, writable
 from ..core.notice import before_compiling
@@ -218,6 +217,8 @@ def out_files(path: Path | None, images: Sequence[Path], one: bool) -> dict[Path
     InputError
         If the folder cannot be created.
     """
+    from ..core.data import twice
+
     if path is None:
         return {}
     if one:

@@ -534,7 +534,7 @@ def _doubts(
         tie: Mask = np.asarray(np.isnan(problem.network.sigma).any(axis=1))[problem.network.point_of]
         rows = suspects(problem) if not of_control or tie.any() else np.zeros(0, dtype=np.intp)
         rows = rows[tie[rows]] if of_control else rows
-        uneven = uneven_axes(problem, rows) if len(rows) else []
+        uneven = uneven_axes(problem, rows) if len(rows) and not held else []
         if uneven:
             # What else contradicts does so by these weights.
             return uneven
