@@ -35,9 +35,9 @@ CAMERA = {
 }
 """Pages that use what the tour of a camera has made."""
 ALONE = (
-    "coded-testfield", "fiducial-marks", "learnt-marks", "n-wire-phantom", "reseau-on-film", "sensor-from-files",
-    "several-cameras", "sharpness", "sheet-of-disks", "temperature-zoom-focus", "turntable",
-    "when-an-adjustment-fails",
+    "coded-testfield", "fiducial-marks", "learnt-marks", "n-wire-phantom", "reseau-on-film",
+    "sensor-from-files", "several-cameras", "sharpness", "sheet-of-disks", "temperature-zoom-focus",
+    "turntable", "when-an-adjustment-fails",
 )  # fmt: skip
 """Pages that draw what they need."""
 OF_TOURS = {"blurred-network": "blurred-under-water", "through-water-or-glass": "underwater"}
