@@ -21,6 +21,7 @@ from reseau.core import figures
 from reseau.core.data import Frame
 from reseau.core.failure import Failure
 from reseau.core.figures import to_bytes
+from reseau.core.memory import keep_loaded
 from reseau.core.threads import always_one_thread
 from reseau.io import TestfieldDesign
 from reseau.measure.points import Measured
@@ -49,7 +50,7 @@ gc.disable()
 
 def pytest_collection_finish() -> None:
     """Look through what tests make, and not through all modules again."""
-    gc.freeze()
+    keep_loaded()
     gc.enable()
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from reseau.core.memory import keep_loaded
 from reseau_sims.serving import KINDS
 
 HEAD = """\
@@ -38,6 +39,12 @@ range: the time stamp is one hour ahead; power-cycled: the camera loses control 
 frame was damaged, stale or repeated.
 
 """
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _other_tests_garbage() -> None:
+    """Answers have 0.15 s; to look through what earlier tests keep takes longer, and all threads wait."""
+    keep_loaded()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
