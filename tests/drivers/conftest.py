@@ -16,12 +16,12 @@ Written by `python benchmarks/faults.py --exchanges 10000`; each cell is one or 
 `test_battery.py`. A fault affects an answer during the work of the driver: in process the 1st, 2nd, 3rd and
 5th answer, otherwise the 3rd. A cell contains the outcome and the longest time until it was known: *right*
 (the work succeeded as without the fault), or the class of the error, which names instrument and command. Time
-limits are short in these tests: 0.15 s for an answer of Zaber, SMC100, Ping360 and CompactPulser, 0.5 s for a
+limits are short in these tests: 0.5 s for an answer of Zaber, SMC100, Ping360 and CompactPulser, 0.5 s for a
 call of BK and of a camera, 0.7 s for an oscilloscope. Every test also asserts that no answer was taken for
 the answer to another query, that the instrument could be recovered, that the following work was right, and
 that the numbers of file descriptors, sockets and threads are unchanged.
 
-Faults of the line: late (0.2 s), dropped, truncated, repeated, corrupted, disconnected; faults of the
+Faults of the line: late (0.6 s), dropped, truncated, repeated, corrupted, disconnected; faults of the
 instrument: stuck, wrong state, out of range, power-cycled. `test_endurance` continues with one fault in a
 hundred answers.
 
@@ -43,7 +43,7 @@ frame was damaged, stale or repeated.
 
 @pytest.fixture(autouse=True, scope="module")
 def _other_tests_garbage() -> None:
-    """Answers have 0.15 s; to look through what earlier tests keep takes longer, and all threads wait."""
+    """Answers have half a second; to look through what earlier tests keep takes as long, and all wait."""
     keep_loaded()
 
 

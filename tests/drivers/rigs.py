@@ -55,6 +55,8 @@ from reseau_sims.serving.usbtmc import UsbInstrument, plugged_in
 from reseau_sims.serving.v4l2 import VideoCamera
 
 TRANSPORTS = ("pty", "tcp", "in process")
+ANSWER_S, LATE_S, WORK_S = 0.5, 0.6, 3.0
+"""Time limits of an answer, also on a busy machine, and of work; when an answer comes that is late."""
 _ATTEMPTS = 3
 _SERVERS: dict[str, Callable[..., Server]] = {"pty": PtyServer, "tcp": TcpServer, "udp": UdpServer}
 
@@ -152,7 +154,7 @@ def zaber_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
         "tilt": AxisPlan(1, 1, per_unit=1000.0, high=100.0, backlash=0.5),
         "roll": AxisPlan(2, 1, per_unit=500.0, high=100.0),
     }
-    device = Table("table", Zaber(link_to(address), 0.15), plans, seconds=1.2)
+    device = Table("table", Zaber(link_to(address), ANSWER_S), plans, seconds=WORK_S)
     device.configure(speed=800.0)
     return _table_rig(device, machine, script, server)
 
@@ -160,7 +162,9 @@ def zaber_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
 def smc100_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     machine = Smc100Line(1, low=0.0, high=100.0, speed=800.0)
     address, server = _wired(stack, transport, machine, script)
-    device = Table("roll", Smc100(link_to(address), 0.15), {"roll": AxisPlan(1, high=100.0)}, seconds=1.2)
+    device = Table(
+        "roll", Smc100(link_to(address), ANSWER_S), {"roll": AxisPlan(1, high=100.0)}, seconds=WORK_S
+    )
     device.configure(speed=800.0)
     return _table_rig(device, machine, script, server)
 
@@ -173,7 +177,7 @@ def kinesis_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     plans = {"tilt": AxisPlan(1, per_unit=1919.64, high=100.0, backlash=0.5)}
     if rack:
         plans["roll"] = AxisPlan(2, per_unit=1000.0, high=100.0)
-    device = Table("table", Kinesis([link_to(address)], rack=rack, answer_s=0.15), plans, seconds=1.2)
+    device = Table("table", Kinesis([link_to(address)], rack=rack, answer_s=ANSWER_S), plans, seconds=WORK_S)
     device.configure(speed=800.0)
     return _table_rig(device, machine, script, server)
 
@@ -200,7 +204,7 @@ def _lines_rig(
         "tilt": AxisPlan(axis=1, per_unit=2.0, high=100.0, backlash=0.5),
         "z": AxisPlan(axis=2, unit="mm", high=100.0),
     }
-    device = Table("table", controller(link_to(address, keep_up=True), 0.15), plans, seconds=1.2)
+    device = Table("table", controller(link_to(address, keep_up=True), ANSWER_S), plans, seconds=WORK_S)
     device.configure(speed=800.0)
     return _table_rig(device, machine, script, server)
 
@@ -226,7 +230,9 @@ def hand_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
 def ping360_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     machine = serving.Ping360()
     address, server = _wired(stack, transport, machine, script)
-    device = Ping360("sonar", link_to(address), Ping360Settings(half_sector=2), seconds=1.2, answer_s=0.15)
+    device = Ping360(
+        "sonar", link_to(address), Ping360Settings(half_sector=2), seconds=WORK_S, answer_s=ANSWER_S
+    )
 
     def work(run: int) -> None:
         for angle in ((37 * run + 11 * k) % 200 - 100 for k in range(5)):
@@ -288,7 +294,7 @@ def bk_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
 def pulser_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     machine = serving.CompactPulser()
     address, server = _wired(stack, transport, machine, script)
-    device = CompactPulser("pulser", link_to(address), seconds=1.2, answer_s=0.15)
+    device = CompactPulser("pulser", link_to(address), seconds=WORK_S, answer_s=ANSWER_S)
 
     def work(run: int) -> None:
         width = 20.0 + run % 900
@@ -315,7 +321,7 @@ def environment_scpi_rig(stack: ExitStack, transport: str, script: FaultScript) 
         address: Any = f"TCPIP::127.0.0.1,{server.port}::inst0::INSTR"
     else:
         address, server = _wired(stack, transport, machine, script)
-    device = environment_scpi("air", address, quantities=asked, answer_s=0.15, seconds=1.2)
+    device = environment_scpi("air", address, quantities=asked, answer_s=ANSWER_S, seconds=WORK_S)
     return _sensor_rig(device, machine, script, server)
 
 
@@ -329,7 +335,9 @@ def environment_modbus_rig(stack: ExitStack, transport: str, script: FaultScript
         "humidity": {"register": 1, "scale": 0.1},
         "pressure": {"format": "float32", **far},
     }
-    device = environment_modbus("air", address, quantities=registers, unit=7, answer_s=0.15, seconds=1.2)
+    device = environment_modbus(
+        "air", address, quantities=registers, unit=7, answer_s=ANSWER_S, seconds=WORK_S
+    )
     return _sensor_rig(device, machine, script, server)
 
 
@@ -340,7 +348,7 @@ def environment_line_rig(stack: ExitStack, transport: str, script: FaultScript) 
     address, server = _wired(stack, transport, machine, script)
     device = environment_line(
         "air", address, pattern=LineSensor.PATTERN, quantities=_SENSED, query="?\n" if asked else "",
-        checksum="xor" if checked else "none", answer_s=0.15, seconds=1.2,
+        checksum="xor" if checked else "none", answer_s=ANSWER_S, seconds=WORK_S,
     )  # fmt: skip
     return _sensor_rig(device, machine, script, server)
 

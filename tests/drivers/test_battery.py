@@ -15,7 +15,7 @@ import pytest
 from reseau.core.errors import InstrumentError
 from reseau_sims.serving import KINDS, Fault, FaultScript, Kind
 
-from .rigs import RIGS, Rig, aravis_is_missing, left_open, rig
+from .rigs import LATE_S, RIGS, Rig, aravis_is_missing, left_open, rig
 
 CELLS = [
     pytest.param(driver, transport, kind, at, marks=() if at in (0, 2) else pytest.mark.slow)
@@ -55,7 +55,7 @@ def test_a_fault_gives_the_right_result_or_an_error_in_time(
         record_property(key, value)
     with rig(driver, transport, script) as found:
         found.work(0)
-        script.fault_at(script.count + at, Fault(kind, 0.2))
+        script.fault_at(script.count + at, Fault(kind, LATE_S))
         began = time.monotonic()
         message = None
         try:
