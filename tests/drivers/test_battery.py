@@ -55,7 +55,7 @@ def test_a_fault_gives_the_right_result_or_an_error_in_time(
         record_property(key, value)
     with rig(driver, transport, script) as found:
         found.work(0)
-        script.fault_at(script.count + at, Fault(kind, LATE_S))
+        script.fault_at(script.count + at, Fault(kind, LATE_S if kind == "late" else 0.2))
         began = time.monotonic()
         message = None
         try:
