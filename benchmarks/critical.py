@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.optimize
 import scipy.special
-from degenerate import HEIGHT, PITCH, WIDTH, network_of, projected
+from degenerate import HEIGHT, PITCH, WIDTH, document_of, network_of, projected
 from parts import add_options, executor_of, main_of, outcomes
 from scipy.spatial.transform import Rotation
 
@@ -92,26 +92,7 @@ def drawn(seed: int) -> tuple[dict[str, Any], Array, Array, Array, str, float, f
         seen += [(i, j, xy[j]) for j in np.flatnonzero(inside)]
     count = np.bincount([j for _, j, _ in seen], minlength=points)
     seen = [row for row in seen if count[row[1]] > 1]
-    document = {
-        "schema": "reseau-network/1", "unit": "mm", "datum": "free",
-        "cameras": [{
-            "id": "C", "width": WIDTH, "height": HEIGHT, "pitch_mm": [PITCH, PITCH], "model": "brown",
-            "side": "object", "parameters": {"c": float(CAMERA[0])}, "free": [],
-        }],
-        "images": {
-            "id": [f"i{k}" for k in range(images)], "camera": ["C"] * images,
-            "X0": [None] * images, "rotation": [None] * images,
-        },
-        "points": {
-            "id": [f"p{k}" for k in range(points)], "xyz": [None] * points, "sigma": [None] * points,
-            "role": ["tie"] * points,
-        },
-        "observations": {
-            "image": [f"i{row[0]}" for row in seen], "point": [f"p{row[1]}" for row in seen],
-            "x": [float(row[2][0]) for row in seen], "y": [float(row[2][1]) for row in seen],
-            "sx": [sigma] * len(seen), "sy": [sigma] * len(seen),
-        },
-    }  # fmt: skip
+    document = document_of(images, points, seen, sigma, float(CAMERA[0]), ())
     return document, xyz, x0, rotation, surface, departure, sigma
 
 

@@ -13,6 +13,7 @@ The 95 % intervals are those of the parameters of the camera, in networks with d
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,13 +75,20 @@ def drawn(seed: int) -> tuple[dict[str, Any], Array, Array, Array, float]:
         xy = projected(rays)
         inside = (xy > 5).all(axis=1) & (xy < [WIDTH - 6, HEIGHT - 6]).all(axis=1) & (rays[:, 2] > 0)
         seen += [(i, j, xy[j]) for j in np.flatnonzero(inside)]
-    image, point = (np.array([row[k] for row in seen]) for k in (0, 1))
+    document = document_of(images, points, seen, sigma, 12.3, NAMES)
+    return document, xyz, x0, rotation, sigma
+
+
+def document_of(
+    images: int, points: int, seen: list[tuple[int, int, Array]], sigma: float, c: float, free: Sequence[str]
+) -> dict[str, Any]:
+    """A free network without approximate values, of image points (image, point, xy)."""
     xy = np.array([row[2] for row in seen])
-    document = {
+    return {
         "schema": "reseau-network/1", "unit": "mm", "datum": "free",
         "cameras": [{
             "id": "C", "width": WIDTH, "height": HEIGHT, "pitch_mm": [PITCH, PITCH], "model": "brown",
-            "side": "object", "parameters": {"c": 12.3}, "free": list(NAMES),
+            "side": "object", "parameters": {"c": c}, "free": list(free),
         }],
         "images": {
             "id": [f"i{k}" for k in range(images)], "camera": ["C"] * images,
@@ -91,11 +99,10 @@ def drawn(seed: int) -> tuple[dict[str, Any], Array, Array, Array, float]:
             "role": ["tie"] * points,
         },
         "observations": {
-            "image": [f"i{k}" for k in image], "point": [f"p{k}" for k in point],
+            "image": [f"i{row[0]}" for row in seen], "point": [f"p{row[1]}" for row in seen],
             "x": xy[:, 0].tolist(), "y": xy[:, 1].tolist(), "sx": [sigma] * len(xy), "sy": [sigma] * len(xy),
         },
     }  # fmt: skip
-    return document, xyz, x0, rotation, sigma
 
 
 def network_of(document: dict[str, Any], errors: Array) -> Network:

@@ -339,9 +339,8 @@ def calibrate(
         photographs = _named(images, channel, colours)
     lenses: CameraOptions | dict[str, CameraOptions]
     if isinstance(model, Mapping):
-        lenses = {
-            camera: lens(model.get(camera)) for camera in {*model, *(each.camera for each in taken.values())}
-        }
+        cameras = dict.fromkeys([*model, *(each.camera for each in taken.values())])
+        lenses = {camera: lens(model.get(camera)) for camera in cameras}
     else:
         lenses = lens(model)
     return calibrate_photographs(
