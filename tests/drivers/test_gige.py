@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -495,3 +496,13 @@ def test_every_format_of_the_convention_is_decoded(name: str) -> None:
         away = np.abs(shot.pixels.astype(int) - body.drawn[-1])
         assert away.max() <= (3 if "565" in name else 0)
         assert bool(shot.raw) == name.startswith(("RGB", "BGR", "YUV", "YCb"))
+
+
+def test_a_stream_has_no_raw_socket_which_would_receive_frames_of_other_cameras() -> None:
+    with ExitStack() as stack:
+        (simulated,) = vision_cameras(stack, SimulatedCamera())
+        camera = stack.enter_context(aravis("camera", simulated.address, settings={"trigger": "software"}))
+        camera.expose(10.0)
+        raw = {line.split()[-1] for line in Path("/proc/net/packet").read_text().splitlines()[1:]}
+        own = {os.readlink(fd) for fd in Path("/proc/self/fd").iterdir() if os.path.islink(fd)}
+        assert not {f"socket:[{inode}]" for inode in raw} & own

@@ -7,7 +7,9 @@ installed, the driver reports it when it connects. Each buffer is copied and alw
 from __future__ import annotations
 
 import math
+import os
 import shlex
+import socket
 import time
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,6 +19,8 @@ from functools import cache, partial
 from operator import methodcaller
 from threading import Event, Thread
 from typing import Any
+
+import psutil
 
 from reseau.core.errors import (
     ConnectionLost,
@@ -37,6 +41,8 @@ from .gvcp import HEARTBEAT_S, controlled_elsewhere, is_ip, require_answer, requ
 
 _UNKNOWN_PERIOD_NS = 1_000_000_000
 _RELEASE_S = 0.5
+_OUTLIVING_S = 0.1
+"""Time by which a device outlives the signal that its control is lost."""
 _CLOCK_IS_OLD_NS = 1_000_000_000
 """Age of a reading of the clock from which the exposures of a rig need another one."""
 _LATCHES = (
@@ -211,6 +217,7 @@ class Aravis:
         self._stream: Any = None
         self._parser: Any = None
         self._lost = Event()
+        self._losing: list[Any] = []
         self._running = False
         self._ours_until = 0.0
         self._settings = AravisSettings()
@@ -258,7 +265,7 @@ class Aravis:
         require_control(self._address, deadline, self._ours_until)
         with self._translated_errors("open"):
             self._camera = library.Camera.new(self._address)
-            self._camera.get_device().connect("control-lost", lambda *_: lost.set())
+            self._camera.get_device().connect("control-lost", partial(_lost, lost, self._losing))
             if self._camera.is_gv_device() and not self._camera.get_device().is_controller():
                 raise controlled_elsewhere(self._address)
             # A previous application may have died during an acquisition; the receiver is set at the next
@@ -273,7 +280,9 @@ class Aravis:
         # The library releases the control when the last reference is dropped, and retries for a long time.
         self._stream = self._parser = self._camera = None
         if held:
-            releasing = Thread(target=_release, args=(held, running), name="Aravis", daemon=True)
+            releasing = Thread(
+                target=_release, args=(held, running, self._losing), name="Aravis", daemon=True
+            )
             releasing.start()
             releasing.join(_RELEASE_S)
             # A camera that did not receive the release keeps our control until our heartbeat times out.
@@ -379,10 +388,15 @@ class Aravis:
         if self._running:
             return
         with self._translated_errors("start") as camera:
+            if camera.is_gv_device():
+                # Raw sockets of a superuser receive frames of other cameras, too, before their filter is set.
+                camera.gv_set_stream_options(_library()[0].GvStreamOption.PACKET_SOCKET_DISABLED)
             self._stream = camera.create_stream(None, None)
             if self._stream is None:
                 raise RefusedError("does not open a stream", do="is it open in another program?")
             payload = camera.get_payload()
+            if camera.is_gv_device():
+                _widen(self._stream, 4 * payload)
             for _ in range(self._settings.buffers):
                 self._stream.push_buffer(_library()[0].Buffer.new_allocate(payload))
             camera.start_acquisition()
@@ -600,12 +614,32 @@ class Aravis:
             raise ConnectionLost("was closed during the call") from None
 
 
-def _release(held: list[Any], running: bool) -> None:
-    """Stop the camera and drop the only reference to it."""
+def _release(held: list[Any], running: bool, losing: list[Any]) -> None:
+    """Stop the camera and drop the only reference to it, unless its own thread has just lost control."""
     with suppress(Exception):
         if running:
             held[0].stop_acquisition()
     held.clear()
+    if losing:
+        # A device that ends in its own thread waits for itself, and the library aborts the process.
+        time.sleep(_OUTLIVING_S)
+        losing.clear()
+
+
+def _lost(lost: Event, losing: list[Any], device: Any) -> None:
+    """Note that control was lost; in the device's thread, which must not drop the last reference."""
+    losing.append(device)
+    lost.set()
+
+
+def _widen(stream: Any, size: int) -> None:
+    """Let the socket of a stream buffer so many bytes; the library does it only after the first packets."""
+    stream.set_property("socket-buffer", _library()[0].GvStreamSocketBuffer.FIXED)
+    stream.set_property("socket-buffer-size", size)
+    for each in psutil.Process().net_connections("udp4"):
+        if each.laddr and each.laddr.port == stream.get_port():
+            with socket.socket(fileno=os.dup(each.fd)) as same:
+                same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
 
 
 def _held(thing: Any) -> Any:
