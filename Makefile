@@ -4,21 +4,25 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= out
 PIP    := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
-# One more than processors: tests of drivers wait for time-outs.
-WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
+# More than processors: tests of drivers wait for time-outs.
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 2)')
 # Bytecode is kept, also where the environment says otherwise: workers, and commands that tests start, share it.
 export PYTHONDONTWRITEBYTECODE :=
 # What Debian's gir1.2-aravis-0.8 brings: GigE Vision and USB3 Vision.
 ARAVIS  := $(wildcard /usr/lib/*/girepository-1.0/Aravis-0.8.typelib)
 
-.PHONY: demo test lint docs rig slow bench bench-compare aravis clean
+.PHONY: demo test tests lint docs rig slow bench bench-compare aravis clean
 
 demo: aravis
 	$(BIN)/reseau demo --out $(OUT)
 
-# A file stays with one worker: what it computes once, and compiles, is not computed twice.
-test: lint
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+# Types are checked while tests wait. Tests that follow each other stay with one worker, and share what they compute
+# once, until another has nothing left to do.
+test: $(VENV)/.test
+	$(MAKE) -j 2 lint tests
+
+tests: $(VENV)/.test
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .

@@ -173,6 +173,7 @@ def test_the_lines_of_the_readme_make_of_photographs_a_calibration_its_file_and_
     assert calibration.plot().get_title(loc="left") == "error of the projection / px"
 
 
+@pytest.mark.slow
 def test_measured_marks_are_shown_written_and_read_back(
     photographs: list[reseau.Frame], tmp_path: Path
 ) -> None:

@@ -207,6 +207,7 @@ def said(result: object) -> str:
     return " ".join(map(str, result.warnings)) if isinstance(result, Result) else result.reason  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_a_mirrored_control_is_found() -> None:
     world = networks.world(images=8, points=40, control=6, cameras=(SIMPLE,))
     network = world.noisy(1)

@@ -47,6 +47,7 @@ def ratio(k3: float, seed: int, *, considers: bool) -> float:
     return float(square[corners].sum() / variance[corners].sum())
 
 
+@pytest.mark.slow
 def test_a_coefficient_that_was_not_estimated_is_in_the_uncertainty_of_the_corners() -> None:
     # Each term is a quarter of the one before it, of either sign: k1, k2 and this k3 are such a series.
     k3 = 0.0125 * np.random.default_rng(11).normal(size=RUNS)

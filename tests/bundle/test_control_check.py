@@ -35,6 +35,7 @@ def parabolic() -> Array:
     return DEFLECTION * u**2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outliers", ["keep", "reject"])
 def test_a_bent_figure_that_is_given_as_plane_is_reported_with_its_deflection(outliers: str) -> None:
     found = adjust_network(plane(parabolic()), Options(outliers=outliers))  # type: ignore[arg-type]

@@ -640,7 +640,9 @@ SLOW = {
     "focal length in millimetres", "one focal length in millimetres", "principal point in pixels",
     "control points exchanged", "mirrored control", "y upwards", "control point with a typing error",
     "height of a control point wrong", "an image mirrored", "one name for two points",
-    "a decimal point lost", "one station",
+    "a decimal point lost", "one station", "x and y exchanged", "heights of control counted downwards",
+    "an image of another scene", "some control points in feet", "a negative coordinate",
+    "pixels wider than said", "parallel views", "given rotations in the other sense",
 }  # fmt: skip
 
 
@@ -724,6 +726,7 @@ def test_control_on_a_line_is_named() -> None:
     assert Code.COLLINEAR in codes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wrong", "code"), [(True, Code.SIGMAS_DOUBTFUL), (False, Code.GROSS_ERRORS)])
 def test_standard_deviations_of_x_and_y_compete_with_gross_errors(wrong: bool, code: Code) -> None:
     """Standard deviations in x that are too small by a hundred, or right ones and some gross errors in x."""

@@ -41,6 +41,7 @@ def test_points_have_depth_where_the_base_shows_in_the_images(base: float) -> No
     assert adjust_network(turning(base, 2))
 
 
+@pytest.mark.slow
 def test_errors_of_rotations_alone_are_as_large_as_their_standard_deviations() -> None:
     squares = []
     for seed in range(20):

@@ -58,6 +58,7 @@ def is_ambiguous(result: Result) -> bool:
     return any(remark.code is Code.AMBIGUOUS for remark in result.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 2])
 def test_rotations_have_no_sigma_where_points_are_on_a_cylinder_through_the_stations(seed: int) -> None:
     result = adjusted(from_two_places(cylinder(seed), seed))

@@ -108,10 +108,10 @@ def places(found: Rectification) -> np.ndarray:
 
 @pytest.mark.parametrize("unknown", range(10))
 def test_the_error_of_rows_is_what_each_unknown_makes_of_it(unknown: int) -> None:
-    names, step = np.array([0, 3]), [1.0, 1.0, 1.0, 1.0, *3 * [1e-3], *3 * [0.5]][unknown]
+    names, step = np.array([0, 3]), [0.25, 0.25, 0.25, 0.25, *3 * [1e-3], *3 * [0.5]][unknown]
     lenses = [
-        CameraMapping(m, *size, names, np.zeros((2, 2)))
-        for m, size in ((LEFT, (640, 480)), (WIDE, (800, 600)))
+        CameraMapping(m.with_values(np.r_[m.values[:4] / 4, m.values[4:]]), *size, names, np.zeros((2, 2)))
+        for m, size in ((LEFT, (160, 120)), (WIDE, (200, 150)))
     ]
     only = np.zeros((10, 10))
     only[unknown, unknown] = step**2

@@ -88,6 +88,7 @@ def test_an_observed_point_without_rays_does_not_stop_the_adjustment() -> None:
     assert not fit.usable.points[3]
 
 
+@pytest.mark.slow
 def test_an_image_with_mostly_gross_errors_is_left_out_as_a_whole() -> None:
     world = networks.world(images=8, points=30)
     net = world.noisy(1)

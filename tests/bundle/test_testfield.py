@@ -160,6 +160,7 @@ def test_a_bend_of_the_board_itself_is_in_the_heights_within_their_sigma() -> No
     assert np.abs(true[free] / sigma[free]).max() > 8
 
 
+@pytest.mark.slow
 def test_additional_parameters_that_are_not_needed_are_dropped_one_by_one() -> None:
     """Of a lens with b3 and b7 alone these stay, and nothing else changes but the redundancy."""
     network = paper(noise=0.04)

@@ -42,6 +42,7 @@ def views(network: Network) -> Rows:
     return views_of(adjust_network(network).required().fit)
 
 
+@pytest.mark.slow
 def test_copies_that_repeat_their_errors_are_one_view() -> None:
     for seed in range(3):
         found = views(copied(WORLD.network, 5.0, seed)).reshape(COPIES, -1)

@@ -154,6 +154,7 @@ TABLES: dict[str, Callable[[], tuple[Any, Callable[[InProcess], Any]]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["kinesis", *(pytest.param(k, marks=pytest.mark.slow) for k in TABLES if k != "kinesis")]
 )

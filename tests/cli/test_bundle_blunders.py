@@ -134,6 +134,7 @@ def test_swapped_point_names_are_named_and_rejected(reseau: Run, tmp_path: Path)
     assert found["sigma0"] < 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [1, *slowly(0, 2)])
 def test_mirrored_control_is_reported(axis: int, reseau: Run, tmp_path: Path) -> None:
     document = block()

@@ -62,6 +62,7 @@ def test_control_in_a_file_of_its_own_held_and_weighted(reseau: Run, tmp_path: P
     assert weighted["redundancy"] == inside["redundancy"]
 
 
+@pytest.mark.slow
 def test_one_sigma_for_all_image_coordinates_and_another_datum(reseau: Run, network: Path) -> None:
     _, out, _ = reseau("bundle", network, "--datum", "free", "--json")
     free = json.loads(out)
@@ -99,6 +100,7 @@ def test_a_network_is_converted_with_its_settings(reseau: Run, network: Path, tm
     assert one["sigma0"] == other["sigma0"]
 
 
+@pytest.mark.slow
 def test_a_list_of_all_datum_points_means_all_points(reseau: Run, tmp_path: Path) -> None:
     """Without a list weak points are left out of the datum; with one the choice is that of the user."""
     document = content() | {"datum": "free"}

@@ -90,6 +90,7 @@ def test_windows_and_media_are_estimated_from_the_command_line(
     assert "Windows and media" in (tmp_path / "r.html").read_text()
 
 
+@pytest.mark.slow
 def test_without_the_water_the_global_test_fails(reseau: Run, network: Callable[..., Path]) -> None:
     document = behind_water()
     del document["refraction"]

@@ -74,6 +74,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(
     assert "camera.yml: has the suffix '.yml'; use .json for the calibration alone, or a name without" in err
 
 
+@pytest.mark.slow
 def test_where_nothing_can_be_calibrated_no_folder_is_made(reseau: Run, photos: Path, tmp_path: Path) -> None:
     few = tmp_path / "few"
     few.mkdir()

@@ -175,6 +175,7 @@ def test_an_edge_that_cannot_be_measured_affects_the_sharpness_only(
     assert "psf" not in Calibration.read(Path("sensor.json")).parameters
 
 
+@pytest.mark.slow
 def test_a_saturated_edge_is_reported(
     asked: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

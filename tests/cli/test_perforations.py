@@ -51,6 +51,7 @@ def test_scale_and_rotation_follow_from_the_perforations(film: Path, reseau: Run
     assert quantities["scale along"]["sigma"] < 0.05
 
 
+@pytest.mark.slow
 def test_results_have_units_and_as_many_digits_as_the_sigma_supports(film: Path, reseau: Run) -> None:
     status, out, _ = reseau("measure", "perforations", film, *OPTIONS)
     assert status == 0

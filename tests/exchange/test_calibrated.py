@@ -44,6 +44,7 @@ def first() -> Result:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use", ["observed", "held"])
 def test_a_camera_entry_names_its_calibration(first: Result, use: str, tmp_path: Path) -> None:
     calibration_of(first, "camera", name="front").write(tmp_path / "front.json")

@@ -76,6 +76,7 @@ def test_what_a_killed_worker_had_is_done_by_the_others(executor: Executor, clus
     assert found == [(f"j{i}", i * i) for i in range(120)]
 
 
+@pytest.mark.slow
 def test_a_cluster_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("reseau.execution.cluster._PATIENCE_S", 0.2)
     with pytest.raises(UsageError, match=r"cluster tcp://127\.0\.0\.1:9: does not answer"):

@@ -55,6 +55,7 @@ def benchmark(name: str) -> Any:
     return importlib.import_module(name)
 
 
+@pytest.mark.slow
 def test_simulated_tests_of_significance(executor: Executor) -> None:
     work = partial(benchmark("group_a").tested, size=2.0)
     found = list(benchmark("parts").outcomes(executor, work, range(5), together=2))

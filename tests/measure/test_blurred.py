@@ -87,6 +87,7 @@ def test_the_focus_is_estimated_with_the_place() -> None:
     assert abs(found.varied[0, 0] - 0.15) < 4 * found.varied_sigma[0, 0] + 0.005
 
 
+@pytest.mark.slow
 def test_an_index_is_estimated_with_the_place() -> None:
     glass = Varied(("index",), (0.01,), lambda by: camera(index=0.004 + by[0]))
     wrong = glass.camera(np.zeros(1))

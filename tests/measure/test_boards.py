@@ -309,6 +309,7 @@ def test_of_two_tags_that_contradict_each_other_none_names_the_board() -> None:
     assert other.code is Code.INCONSISTENT
 
 
+@pytest.mark.slow
 def test_a_corner_from_which_sharpening_reaches_beyond_the_frame_is_declined() -> None:
     """What the filter took from there is unknown: one at 1.4 px from the border was off by 25 sigma."""
     printed = prints.chess(10, 7, 25.0)
@@ -345,6 +346,7 @@ def test_sharpened_pictures_have_the_sigmas_of_their_errors(
     assert 0.83 < over_sigmas(found, error) < 1.2
 
 
+@pytest.mark.slow
 def test_corners_on_paper_that_is_saturated_everywhere_are_measured_to_their_sigmas() -> None:
     """The middle of every edge is not, and tells where it is: as many corners as ``aprilgrid`` finds, 132."""
     printed = prints.aprilgrid(6, 6, 22.0, 0.3, "DICT_APRILTAG_36h11", 2)
@@ -387,6 +389,7 @@ def test_corners_of_markers_on_saturated_paper_have_the_sigmas_of_their_errors(
     assert low < over_sigmas(found, error) < 1.2
 
 
+@pytest.mark.slow
 def test_circles_cut_by_the_border_are_right_where_a_filter_does_not_know_what_is_beyond() -> None:
     """The outermost lines of a blurred file continue its border: circles there were off by ten sigma."""
     printed, design = prints.circles(9, 7, 25.0, 12.0), board("circles", 9, 7, 25.0, size=12.0)
@@ -430,6 +433,7 @@ def test_errors_behind_a_fisheye_are_those_of_their_sigmas(
     assert np.abs(in_sigmas(found, error)).max() < 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*slowly("charuco"), "aprilgrid"])
 def test_markers_far_from_the_axis_of_a_fisheye_name_the_corners_of_a_board(kind: str) -> None:
     """No polynomial in the image by a projectivity describes it: 2 of 59 corners were found, off by 2 px."""
@@ -449,6 +453,7 @@ def test_markers_far_from_the_axis_of_a_fisheye_name_the_corners_of_a_board(kind
     assert np.abs(in_sigmas(found, error)).max() < 5
 
 
+@pytest.mark.slow
 def test_separate_markers_are_measured_to_the_margin_of_a_wide_view() -> None:
     """Their bright cells are not in front of them; 76 of 116 corners were measured, where OpenCV has 106."""
     printed = prints.markers(6, 5, 30.0, 10.0, "DICT_4X4_100")
@@ -464,6 +469,7 @@ def test_separate_markers_are_measured_to_the_margin_of_a_wide_view() -> None:
     assert 0.8 < over_sigmas(found, error) < 1.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("condition", "seed"),
     [("gamma", 0), ("motion6", 0), ("overexposed", 0), *slowly(("gamma", 2), ("motion6", 3))],
@@ -590,6 +596,7 @@ def test_a_part_of_a_puzzleboard_has_the_names_of_that_part() -> None:
     assert not some.notes
 
 
+@pytest.mark.slow
 def test_another_part_of_the_puzzle_and_its_mirror_image_are_declined() -> None:
     frame, _ = puzzle_picture()
     other = measure_board(frame, PUZZLE.model_copy(update={"start": (200, 107)}))

@@ -54,6 +54,7 @@ def test_marks_agree_with_their_neighbours(measured, name):
     assert off.max() <= 1.25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*VOYAGER, FAINT])
 def test_common_marks_agree_better_with_their_neighbours_than_those_of_nasa_s_program(measured, name):
     case, result = measured(name)

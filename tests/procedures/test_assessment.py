@@ -216,6 +216,7 @@ def test_a_failed_global_test_of_small_residuals_is_no_alarm() -> None:
     assert found.fits
 
 
+@pytest.mark.slow
 def test_frontal_photographs_are_not_usable() -> None:
     found = calibrated(measured(6, tilt=0.5)).assessments["camera"]
     assert found.use is not Use.MEASUREMENT

@@ -57,6 +57,7 @@ def test_corresponding_rays_are_measured_where_centroids_are_biased() -> None:
     assert np.sqrt((off**2).mean()) < 0.02
 
 
+@pytest.mark.slow
 def test_several_processes_measure_the_same() -> None:
     project, options = drawn(), NetworkOptions(rounds=1)
     with Processes(2, ["reseau.procedures.blurred_network"]) as executor:

@@ -38,6 +38,7 @@ def measure(frame: Frame) -> Measured | Failure:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_any_function_that_measures_a_frame_is_accepted() -> None:
     frames = [blank(name) for name in (*STATIONS, "empty")]
     model = CameraOptions("brown", ("c",), (0.027, 0.027))

@@ -44,6 +44,7 @@ def test_a_frame_is_refined_to_a_hundredth_of_a_millimetre(world, refined):
     assert np.abs(refined.camera.fit.check.xy - refined.camera.fit.check_target).max() < 0.01
 
 
+@pytest.mark.slow
 def test_marks_measured_elsewhere_give_the_same_result(world, refined):
     again = photo_i(refined.points, world.design, check=HELD)
     assert isinstance(again, PhotoI)

@@ -19,6 +19,7 @@ def world() -> World:
     return World.standard(1)
 
 
+@pytest.mark.slow
 def test_the_shadow_of_a_reseau_covers_only_its_wires(world):
     frame = world.photo_i()
     found = measure_reseau(frame, world.design)

@@ -23,6 +23,7 @@ class Points:
     xy: Array
 
 
+@pytest.mark.slow
 def test_truth_and_group_a_agree_within_the_noise(bench: Bench) -> None:
     camera = bench.truth.camera
     assert camera.position_px == pytest.approx((NOISE_PX, NOISE_PX), rel=0.2)

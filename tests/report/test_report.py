@@ -134,6 +134,7 @@ def test_the_same_input_gives_the_same_bytes_without_clock_times(bench: Bench) -
     assert not re.search(r"20\d\d-\d\d-\d\d", page)
 
 
+@pytest.mark.slow
 def test_figures_and_tables_are_numbered_consecutively(bench: Bench) -> None:
     page = whole_page(bench)
     for kind in ("Figure", "Table"):

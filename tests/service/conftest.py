@@ -1,13 +1,18 @@
-"""Passwords are hashed cheaply in these tests."""
+"""Passwords are hashed cheaply in these tests; one archive serves many of them."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import argon2
 import pytest
+
+from reseau.core.exclusive import lock_file
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -20,9 +25,21 @@ def _cheap_passwords() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def archived(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with an archive that has a session, a calibration, and a history."""
+    """A folder with an archive that has a session, a calibration, and a history; one worker makes it."""
     from .http.populated import populate
 
-    folder = tmp_path_factory.mktemp("archived")
-    populate(folder)
-    return folder
+    own = tmp_path_factory.mktemp("archived")
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        populate(own)
+        return own
+    made = tmp_path_factory.getbasetemp().parent / "archived"
+    with made.with_suffix(".lock").open("ab") as lock:
+        while not lock_file(lock):
+            time.sleep(0.1)
+        if not made.exists():
+            unfinished = made.with_suffix(f".{os.getpid()}")
+            unfinished.mkdir()
+            populate(unfinished)
+            unfinished.rename(made)
+    shutil.copytree(made, own, dirs_exist_ok=True)
+    return own

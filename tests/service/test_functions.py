@@ -67,6 +67,7 @@ def test_a_function_is_fitted_evaluated_and_budgeted_from_the_command_line(
     assert run(["calibrations", "drift", "left", "--covariates", "runs.csv"]) == 0
 
 
+@pytest.mark.slow
 def test_what_sensors_recorded_serves_as_a_table_of_covariates(
     warm: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -105,6 +106,7 @@ def test_points_measured_at_an_uncertain_temperature_share_its_error(warm: Path)
     np.testing.assert_allclose(drawn.sigma, after.sigma, rtol=0.06)  # 5 standard errors
 
 
+@pytest.mark.slow
 def test_a_function_cannot_be_used_where_it_is_not_known(warm: Path) -> None:
     with Archive.open(warm / "archive") as archive:
         from reseau.service import CovariateTable

@@ -364,6 +364,7 @@ def test_alarms_are_sent_once_and_repeated_until_they_are_acknowledged(
             alarms.acknowledge("something", "Ada")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_the_service_sends_alarms_where_an_administrator_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -46,6 +46,7 @@ def test_two_photographs_differ_only_by_noise(world: World, frame: Frame) -> Non
     assert abs(difference.mean()) < 0.02
 
 
+@pytest.mark.slow
 def test_a_frame_is_eight_bit_and_not_saturated(frame: Frame) -> None:
     assert frame.pixels.dtype == np.uint8
     assert frame.pixels.shape == (1200, 1600)

@@ -534,6 +534,7 @@ def test_a_defect_of_a_driver_is_an_answer_and_a_crash_restarts_the_worker(one: 
     assert client.get("/api/1/sessions/defect").json()["status"] == "done"
 
 
+@pytest.mark.slow
 def test_positions_are_reported_while_an_axis_moves_and_who_moves_it(one: Served, rig: Rig) -> None:
     client = one.client("operate")
     client.post(f"{BENCH}/move", json={"axis": "roll", "position": 0.0})

@@ -41,6 +41,7 @@ def test_sessions_and_files_are_read(place: tuple[Path, str, str]) -> None:
         client.get("/sessions")
 
 
+@pytest.mark.slow
 def test_the_commands_print_what_the_service_says(
     place: tuple[Path, str, str],
     capsys: pytest.CaptureFixture[str],
@@ -135,6 +136,7 @@ def test_the_service_is_ready_in_less_than_3_s_of_processor_time(tmp_path: Path)
     assert json.loads(lines[-1])["event"] == "ended"
 
 
+@pytest.mark.slow
 def test_requests_are_answered_beside_50_streams(place: tuple[Path, str, str]) -> None:
     headers = {"Authorization": f"Bearer {place[2]}"}
     limits = httpx.Limits(max_connections=300)

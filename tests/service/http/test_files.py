@@ -223,6 +223,7 @@ def test_colours_resolution_and_tone_curve_of_a_scan_are_kept(tmp_path: Path, de
         assert (kept.dpi, kept.curve) == (2400.0, curved.curve)
 
 
+@pytest.mark.slow
 def test_a_photograph_with_too_many_pixels_or_bytes_in_memory_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "photograph.png"
     _, coded = cv2.imencode(".png", np.zeros((2000, 3000), np.uint8))

@@ -91,6 +91,7 @@ def test_the_command_line_and_a_schedule_ask_the_service_that_holds_the_bench(
     assert Orders(archive, "cellar").all()[-1].by == "schedule weekly"
 
 
+@pytest.mark.slow
 def test_a_capture_of_the_command_line_is_carried_out_by_the_service_that_holds_the_bench(
     defined: Served,
     rig: Rig,  # noqa: F811
@@ -108,6 +109,7 @@ def test_a_capture_of_the_command_line_is_carried_out_by_the_service_that_holds_
     assert capsys.readouterr().err.count("reseau:") == 1
 
 
+@pytest.mark.slow
 def test_a_paused_queue_is_put_in_order_and_withdrawn(defined: Served) -> None:
     client, reader = defined.client("operate"), defined.client("read")
     assert reader.post(f"{ORDERS}/pause").status_code == 403
@@ -135,7 +137,6 @@ class Clock:
         return self.now
 
 
-@pytest.mark.slow
 def test_an_order_that_finds_an_instrument_not_ready_is_tried_again_each_time_later(tmp_path: Path) -> None:
     clock, waits = Clock(), list[float]()
     with Archive.open(tmp_path / "archive", create=True, clock=clock) as archive:
@@ -159,7 +160,6 @@ def test_an_order_that_finds_an_instrument_not_ready_is_tried_again_each_time_la
         assert orders.get(number).state == "failed"
 
 
-@pytest.mark.slow
 def test_an_order_whose_worker_ended_is_continued_by_the_next(tmp_path: Path) -> None:
     with Archive.open(tmp_path / "archive", create=True) as archive:
         orders = Orders(archive, "cellar")
