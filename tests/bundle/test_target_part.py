@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from reseau.bundle import adjust_network, example_network
 from reseau.bundle.diagnostics.target_part import covariance_by_targets
 
 
-@pytest.mark.slow
 def test_it_is_what_errors_of_the_coordinates_do_to_the_camera() -> None:
     """Each coordinate is moved by its sigma, and the network adjusted again."""
     network = example_network()
