@@ -365,6 +365,12 @@ BROKEN = [
         ("image i6 has fewer than three points",),
     ),
     Broken(
+        "three control points and no other",
+        lambda: (lambda n: n.select(n.point_of < 3))(block()),
+        Code.TOO_FEW_POINTS,
+        ("three leave up to four poses",),
+    ),
+    Broken(
         "a point in one image",
         lambda: (lambda n: n.select((n.point_of != 20) | (n.image_of == n.image_of[n.point_of == 20][0])))(
             block()

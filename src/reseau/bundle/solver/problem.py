@@ -428,7 +428,8 @@ class _Run:
         problem, network = self.problem, self.network
         if not self.usable.images.any():
             return Failure(
-                "no image has three points with known or computable coordinates",
+                "no image could be oriented: where its pose is not given, it takes four points with known or "
+                "computable coordinates, of which three leave up to four poses",
                 Code.TOO_FEW_POINTS,
             )
         astray = self._without_axes()
