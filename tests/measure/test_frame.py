@@ -277,7 +277,6 @@ def test_a_scratch_parallel_to_an_edge_is_ignored() -> None:
     assert np.abs(errors(result, frame)).max() < 0.35
 
 
-@pytest.mark.slow
 def test_a_frame_cropped_on_one_side_has_three_edges_and_a_sigma_for_the_fourth() -> None:
     frame = FilmFrame(31, crop="right")
     result = oriented(frame)

@@ -128,7 +128,6 @@ def test_positions_reach_the_cramer_rao_bound(along: float, across: float, curva
     assert (np.abs(normalised - 1) < 0.15).all()
 
 
-@pytest.mark.slow
 def test_positions_are_unbiased_and_the_form_is_estimated():
     grid = np.stack(np.meshgrid(60 + 75 * np.arange(6), 55 + 60 * np.arange(5)), axis=-1).reshape(-1, 2)
     truth = grid + np.random.default_rng(1).uniform(-0.5, 0.5, grid.shape)

@@ -41,6 +41,8 @@ from .gvcp import HEARTBEAT_S, controlled_elsewhere, is_ip, require_answer, requ
 
 _UNKNOWN_PERIOD_NS = 1_000_000_000
 _RELEASE_S = 0.5
+_SO_RCVBUFFORCE = 33
+"""Of Linux; Python's socket does not name it."""
 _OUTLIVING_S = 0.1
 """Time by which a device outlives the signal that its control is lost."""
 _CLOCK_IS_OLD_NS = 1_000_000_000
@@ -633,13 +635,19 @@ def _lost(lost: Event, losing: list[Any], device: Any) -> None:
 
 
 def _widen(stream: Any, size: int) -> None:
-    """Let the socket of a stream buffer so many bytes; the library does it only after the first packets."""
+    """Let the socket of a stream buffer so many bytes, or as many as the system allows.
+
+    The library does it only after the first packets, and not beyond the limit of the system, which the
+    superuser may pass.
+    """
     stream.set_property("socket-buffer", _library()[0].GvStreamSocketBuffer.FIXED)
-    stream.set_property("socket-buffer-size", size)
+    stream.set_property("socket-buffer-size", 0)  # the library leaves it alone
     for each in psutil.Process().net_connections("udp4"):
         if each.laddr and each.laddr.port == stream.get_port():
             with socket.socket(fileno=os.dup(each.fd)) as same:
                 same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
+                with suppress(OSError):
+                    same.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
 
 
 def _held(thing: Any) -> Any:
