@@ -61,8 +61,8 @@ class CoefficientTest:
     Examples
     --------
     >>> test = ratio_test("K3", 3.0, 1.0, 100)
-    >>> test.distribution, test.significant
-    ('t', True)
+    >>> test.distribution, round(test.critical, 2), test.significant
+    ('t', 1.98, True)
     """
 
     name: str
