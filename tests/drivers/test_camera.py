@@ -243,7 +243,8 @@ def test_lost_and_damaged_frames_are_counted_and_not_returned(
     steps = shots[-1].sequence - before.sequence
     assert steps == 6 + shots[-1].dropped - before.dropped
     if lost is not None:
-        assert shots[-1].dropped - before.dropped == lost
+        # A busy machine queues buffers too late.
+        assert lost <= shots[-1].dropped - before.dropped <= lost + device.overruns
 
 
 def test_a_stuck_camera_raises_in_time_and_restarts(device: VideoCamera, camera: Cam) -> None:

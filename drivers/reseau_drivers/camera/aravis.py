@@ -20,7 +20,7 @@ from operator import methodcaller
 from threading import Event, Thread
 from typing import Any
 
-import psutil
+import psutil  # type: ignore[import-untyped, unused-ignore]
 
 from reseau.core.errors import (
     ConnectionLost,

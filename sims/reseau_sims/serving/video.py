@@ -99,6 +99,8 @@ class Video:
         self.body, self.first, self._at_start, self.webcam = body, first, start_of_exposure, webcam
         self.stream: Stream | None = None
         """Stream of the owner."""
+        self.overruns = 0
+        """Frames that were lost because no buffer was queued."""
         self._last: _Exposed | None = None
         body.before_change.append(self.expose)
         self._switch_on()
@@ -156,6 +158,7 @@ class Video:
 
     def _deliver(self, stream: Stream, frame: _Exposed) -> None:
         if not stream.queued or not frame.data:
+            self.overruns += 1
             return
         if frame.fault is None:
             frame.fault = self.body.script.draw()
@@ -195,6 +198,7 @@ class Video:
 
     def _fill(self, stream: Stream, frame: _Exposed) -> None:
         if not stream.queued:
+            self.overruns += 1
             return
         index = stream.queued.popleft()
         stream.memory[index].data[: len(frame.data)] = frame.data
