@@ -270,18 +270,7 @@ def drift(
             table = found.recorded(name, recorded)
         made = found.drift(name, options, table)
     charts, last = made.charts, len(made.keys) - 1
-    verdicts = [
-        {"calibration": made.keys[run], "parameter": made.names[k], "verdict": verdict}
-        for run, k, verdict in (() if made.explanation is None else made.explanation.verdicts)
-    ]
-    signals = [
-        {
-            "calibration": made.keys[run], "parameter": made.names[k],
-            "since": made.keys[charts.since(run, k)],
-            "direction": "increase" if charts.alarm[run, k] > 0 else "decrease",
-        }
-        for run in range(last + 1) for k in range(len(made.names)) if charts.alarm[run, k]
-    ]  # fmt: skip
+    signals, verdicts = made.signals, made.verdicts
     rows = [
         {
             "parameter": parameter, "learning": bool(charts.learning[last, k]),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
@@ -116,12 +115,10 @@ def create(
     A calibration that was rejected, or still needs a review, gets none.
     """
     from ..io import write_whole
-    from ..service.certificates import CertificateData, certify, html_of
-    from ..service.certificates.dcc import dcc_of
-    from ..service.certificates.page import pdf_of
-    from ..service.certificates.signature import sign
+    from ..service.certificates import CertificateData, certify
+    from ..service.certificates.page import contents_of
 
-    kinds = [writable(each, ".pdf", ".xml", ".html").suffix.lower() for each in out]
+    kinds = [writable(each, ".pdf", ".xml", ".html").suffix.lower()[1:] for each in out]
     if len(set(kinds)) < len(kinds):
         raise UsageError("has two files of one kind", where="--out")
     if (signing_key is None) != (signing_certificate is None):
@@ -136,27 +133,14 @@ def create(
         found.calibration, given, issued=_date(issued), decision=found.decision,
         configuration=found.configuration, earlier=found.earlier, probability=probability,
     )  # fmt: skip
-
-    def xml(pages: str = "") -> bytes:
-        content = dcc_of(made, pages)
-        if signing_key is None or signing_certificate is None:
-            return content
-        return sign(content, signing_key, signing_certificate, os.environ.get("RESEAU_KEY_PASSWORD"))
-
-    contents: dict[str, bytes] = {}
-    if ".pdf" in kinds:
-        contents[".pdf"], contents[".xml"] = pdf_of(made, xml)
-    elif ".xml" in kinds:
-        contents[".xml"] = xml()
-    if ".html" in kinds:
-        contents[".html"] = html_of(made).encode("utf-8")
+    contents = contents_of(made, kinds, signing_key, signing_certificate)
     for path, kind in zip(out, kinds, strict=True):
         write_whole(path, contents[kind])
     say(f"{made.identifier}: {', '.join(str(each) for each in out)}\n")
     for line in made.traceability:
         say(f"  {line}\n")
     say(f"  {made.conformity}\n")
-    if ".pdf" in kinds:
+    if "pdf" in kinds:
         say("  written as PDF/A-3b; no validator has examined its conformance\n")
     for what, why in made.uncertainty.missing.items():
         say(f"  not included: {what}; {why}\n")

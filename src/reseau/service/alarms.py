@@ -223,12 +223,11 @@ class Alarms:
             except UsageError as error:  # such as calibrations without a parameter in common
                 found[f"charts {name}"] = f"{name}: its drift is not monitored ({error})"
                 continue
-            for run, k in zip(*drift.charts.alarm.nonzero(), strict=True):
-                direction = "increases" if drift.charts.alarm[run, k] > 0 else "decreases"
-                first = drift.keys[drift.charts.since(int(run), int(k))]
-                which = next(d.name or f"of {d.since:%Y-%m-%d %H:%M}Z" for d in history if d.key == first)
-                text = f"{name}: {drift.names[k]} {direction}, probably since the calibration {which}"
-                found[f"drift {name} {drift.names[k]} {drift.keys[run]}"] = text
+            for signal in drift.signals:
+                first = next(d for d in history if d.key == signal["since"])
+                what = f"{signal['parameter']} {signal['direction']}s, probably since the calibration"
+                key = f"drift {name} {signal['parameter']} {signal['calibration']}"
+                found[key] = f"{name}: {what} {first.name or f'of {first.since:%Y-%m-%d %H:%M}Z'}"
         return found
 
 

@@ -132,3 +132,25 @@ class Drift:
     charts: Monitored
     explanation: Explanation | None = None
     conversion_px: float = 0.0
+
+    @property
+    def signals(self) -> list[dict[str, str]]:
+        """Calibrations and parameters whose charts signal, with the key since which it probably is so."""
+        return [
+            {
+                "calibration": self.keys[run],
+                "parameter": self.names[k],
+                "since": self.keys[self.charts.since(int(run), int(k))],
+                "direction": "increase" if self.charts.alarm[run, k] > 0 else "decrease",
+            }
+            for run, k in zip(*self.charts.alarm.nonzero(), strict=True)
+        ]
+
+    @property
+    def verdicts(self) -> list[dict[str, str]]:
+        """What the covariates say about signals."""
+        found = () if self.explanation is None else self.explanation.verdicts
+        return [
+            {"calibration": self.keys[run], "parameter": self.names[k], "verdict": verdict}
+            for run, k, verdict in found
+        ]

@@ -7,7 +7,7 @@ import io
 import os
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +161,53 @@ def pdf_of(certificate: Certificate, xml: Callable[[str], bytes]) -> tuple[bytes
         )
     ]  # fmt: skip
     return _written(document, certificate), content
+
+
+def contents_of(
+    certificate: Certificate, forms: Collection[str], key: Path | None = None, signer: Path | None = None
+) -> dict[str, bytes]:
+    """Return a certificate in several forms.
+
+    Parameters
+    ----------
+    certificate : Certificate
+        The certificate.
+    forms : collection of {"pdf", "xml", "html"}
+        Its forms; the XML, also that in the PDF, is a DCC.
+    key, signer : Path, optional
+        Private key and certificate, PEM, with which the XML is signed; the password of the key is in
+        RESEAU_KEY_PASSWORD. By default it is not signed.
+
+    Raises
+    ------
+    UsageError
+        As :func:`pdf_of` and :func:`reseau.service.certificates.signature.sign`.
+
+    Examples
+    --------
+    >>> from reseau.service.certificates.certificate import example_certificate
+    >>> sorted(contents_of(example_certificate(), ["html"]))
+    ['html']
+    """
+
+    def xml(pages: str = "") -> bytes:
+        with optional():
+            from .dcc import dcc_of
+            from .signature import sign
+
+        content = dcc_of(certificate, pages)
+        if key is None or signer is None:
+            return content
+        return sign(content, key, signer, os.environ.get("RESEAU_KEY_PASSWORD"))
+
+    found: dict[str, bytes] = {}
+    if "pdf" in forms:
+        found["pdf"], found["xml"] = pdf_of(certificate, xml)
+    elif "xml" in forms:
+        found["xml"] = xml()
+    if "html" in forms:
+        found["html"] = html_of(certificate).encode("utf-8")
+    return found
 
 
 def _written(document: Any, certificate: Certificate) -> bytes:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 from collections.abc import Callable
 from datetime import UTC, date, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -33,6 +32,9 @@ Key = Annotated[str, Path(max_length=100, description="Decision, by its name or 
 SVG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/svg+xml": {}}, "description": "The figure"}
 }  # fmt: skip
+
+
+_KINDS = {"pdf": "application/pdf", "xml": "application/xml", "html": "text/html; charset=utf-8"}
 
 
 class InForce(Answer):
@@ -531,8 +533,7 @@ def service_event(name: Name, given: ServiceEvent, who: Operating, service: Here
 
 @router.post(
     "/configurations/{name}/decisions/{key}/certificate", response_class=Response,
-    responses={200: {"content": {"application/pdf": {}, "application/xml": {}, "text/html": {}},
-                     "description": "The certificate"}},
+    responses={200: {"content": {kind: {} for kind in _KINDS.values()}, "description": "The certificate"}},
 )  # fmt: skip
 def certificate(name: Name, key: Key, given: CertificateOrder, who: Administering, service: Here) -> Response:
     """Create the certificate of an accepted calibration: PDF with its XML, DCC or HTML.
@@ -542,23 +543,12 @@ def certificate(name: Name, key: Key, given: CertificateOrder, who: Administerin
     from ...core.optional import optional
 
     with optional():
-        from ..certificates import CertificateData, certify, html_of
-        from ..certificates.dcc import dcc_of
-        from ..certificates.page import pdf_of
-        from ..certificates.signature import sign
+        from ..certificates import CertificateData, certify
+        from ..certificates.page import contents_of
 
-    known, keys = the_configuration(service, name), service.options
+    known, options = the_configuration(service, name), service.options
     decision = the_decision(known, name, key)
-
-    def xml(pages: str = "") -> bytes:
-        content = dcc_of(made, pages)
-        if keys.signing_key is None or keys.signing_certificate is None:
-            return content
-        return sign(
-            content, keys.signing_key, keys.signing_certificate, os.environ.get("RESEAU_KEY_PASSWORD")
-        )
-
-    facts = {"form": given.form, "signed": given.form != "html" and keys.signing_key is not None}
+    facts = {"form": given.form, "signed": given.form != "html" and options.signing_key is not None}
     with service.audited(who, "certificate", f"{name} {decision.key}", facts), optional():
         data = CertificateData.from_content(dict(given.data), where="data")
         made = certify(
@@ -566,16 +556,12 @@ def certificate(name: Name, key: Key, given: CertificateOrder, who: Administerin
             issued=given.issued or datetime.now(UTC).date(), decision=decision, configuration=name,
             earlier=known.earlier(name, decision), probability=given.probability,
         )  # fmt: skip
-        if given.form == "pdf":
-            content, kind = pdf_of(made, xml)[0], "application/pdf"
-        elif given.form == "xml":
-            content, kind = xml(), "application/xml"
-        else:
-            content, kind = html_of(made).encode("utf-8"), "text/html; charset=utf-8"
+        keys = options.signing_key, options.signing_certificate
+        content = contents_of(made, [given.form], *keys)[given.form]
     from .stored import SANDBOX
 
     headers = {
         "Content-Disposition": f'attachment; filename="certificate.{given.form}"',
         "Content-Security-Policy": SANDBOX,
     }
-    return Response(content, 200, headers, kind)
+    return Response(content, 200, headers, _KINDS[given.form])

@@ -168,14 +168,6 @@ def _answer(service: Service, name: str, made: Drift) -> DriftAnswer:
 
     charts = made.charts
     since = {each.key: each.since.isoformat() for each in the_configuration(service, name).history(name)}
-    signals = [
-        Signal(
-            calibration=made.keys[run], parameter=made.names[k],
-            since=made.keys[charts.since(int(run), int(k))],
-            direction="increase" if charts.alarm[run, k] > 0 else "decrease",
-        )
-        for run, k in zip(*charts.alarm.nonzero(), strict=True)
-    ]  # fmt: skip
     last = len(made.keys) - 1
     return DriftAnswer(
         calibrations=list(made.keys), times=[since[key] for key in made.keys],
@@ -187,11 +179,8 @@ def _answer(service: Service, name: str, made: Drift) -> DriftAnswer:
             )
             for k, each in enumerate(made.names)
         ],
-        signals=signals,
-        explained=[
-            (made.keys[run], made.names[k], verdict)
-            for run, k, verdict in (() if made.explanation is None else made.explanation.verdicts)
-        ],
+        signals=[Signal(**each) for each in made.signals],
+        explained=[(each["calibration"], each["parameter"], each["verdict"]) for each in made.verdicts],
         recorded=service.current(
             f"conditions {name}", lambda: the_configuration(service, name).conditions(name)
         ),
