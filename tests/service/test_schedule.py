@@ -15,7 +15,7 @@ import pytest
 from reseau.archive import Archive
 from reseau.core.errors import EstimationError, FormatError, StateError, UsageError
 from reseau.service import Configurations, Run, Schedule, Schedules
-from reseau.service.schedule import CalendarEvent, Recurrence, calendar_feed
+from reseau.service.schedule import Recurrence
 
 ZONES = (
     "UTC", "Europe/Berlin", "America/New_York", "Australia/Lord_Howe", "Asia/Kolkata", "America/Sao_Paulo"
@@ -356,9 +356,9 @@ def test_the_feed_is_read_by_another_program(schedules: Schedules) -> None:
     assert str(found[0]["description"]) == ("größer, als erlaubt; " * 8)
     assert [each["dtstart"].dt for each in found[:2]] == [week(0), week(1)]
     assert len({str(each["uid"]) for each in found}) == 7
-    odd = calendar_feed([CalendarEvent("a", week(0), week(1), "a\\b;c,d\ne")], week(0))
-    (event,) = icalendar.Calendar.from_ical(odd).walk("VEVENT")
-    assert str(event["summary"]) == "a\\b;c,d\ne"
+    schedules.add(WEEKLY.model_copy(update={"name": "a\\b;c,d\ne"}), week(0))
+    event, *_ = icalendar.Calendar.from_ical(schedules.feed("a\\b;c,d\ne", week(0))).walk("VEVENT")
+    assert str(event["summary"]).startswith("a\\b;c,d\ne: ")
 
 
 def test_a_schedule_is_checked_when_it_is_read() -> None:

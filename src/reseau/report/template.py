@@ -40,10 +40,10 @@ def rendered(template: str, **content: object) -> str:
     return environment().get_template(template).render(content, **counters)
 
 
-def environment() -> jinja2.Environment:
-    """Return the templates, and what they may use."""
+def environment(package: str = "reseau.report", folder: str = "templates") -> jinja2.Environment:
+    """Return the templates of a package, and what they may use."""
     found = jinja2.Environment(
-        loader=jinja2.PackageLoader("reseau.report"),
+        loader=jinja2.PackageLoader(package, folder),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -372,13 +372,16 @@ class Schedules:
     def feed(self, name: str, now: datetime | None = None, ahead: int = 52) -> str:
         """Return the runs of a schedule as an iCalendar feed, with their states."""
         time = a_time(now or self._archive.clock())
+        lines = ["BEGIN:VCALENDAR", "VERSION:2.0", "PRODID:-//reseau//schedule//EN"]
         window = self.get(name).window
-        events = [
-            CalendarEvent(f"{each.key.replace(' ', '-')}-{name}@reseau", each.time, each.time + window,
-                          f"{name}: {each.state}", each.why)
-            for each in self.runs(name, time, ahead)
-        ]  # fmt: skip
-        return calendar_feed(events, time)
+        for each in self.runs(name, time, ahead):
+            lines += [
+                "BEGIN:VEVENT", f"UID:{_escaped(each.key.replace(' ', '-'))}-{_escaped(name)}@reseau",
+                f"DTSTAMP:{_utc(time)}", f"DTSTART:{_utc(each.time)}", f"DTEND:{_utc(each.time + window)}",
+                f"SUMMARY:{_escaped(name)}: {each.state}",
+                *([f"DESCRIPTION:{_escaped(each.why)}"] if each.why else []), "END:VEVENT",
+            ]  # fmt: skip
+        return "".join(f"{_folded(line)}\r\n" for line in [*lines, "END:VCALENDAR"])
 
     def _versions(self, name: str) -> list[tuple[datetime, Schedule | None]]:
         """From when on which schedule counts; None: it was removed."""
@@ -587,53 +590,6 @@ def _until(text: str | None, zone: ZoneInfo) -> datetime | None:
             found += timedelta(days=1, seconds=-1)
         return found.replace(tzinfo=UTC if pattern.endswith("Z") else zone).astimezone(UTC)
     raise UsageError(f"{text!r} is not a date and time", where="UNTIL", do="use 20261231T000000Z")
-
-
-@dataclass(frozen=True)
-class CalendarEvent:
-    """An event of a calendar.
-
-    Parameters
-    ----------
-    uid : str
-        Unique name that stays the same.
-    start, end : datetime
-        Begin and end, UTC.
-    summary, description : str
-        Texts.
-
-    Examples
-    --------
-    >>> now = datetime(2026, 3, 2, 8, tzinfo=UTC)
-    >>> CalendarEvent("weekly-1", now, now + timedelta(hours=2), "weekly: due").summary
-    'weekly: due'
-    """
-
-    uid: str
-    start: datetime
-    end: datetime
-    summary: str
-    description: str = ""
-
-
-def calendar_feed(events: list[CalendarEvent], stamp: datetime) -> str:
-    r"""Return an iCalendar file of events; `stamp` is the time at which it was made.
-
-    Examples
-    --------
-    >>> now = datetime(2026, 3, 2, 8, tzinfo=UTC)
-    >>> calendar_feed([CalendarEvent("a", now, now, "due, at once")], now).splitlines()[5:8]
-    ['DTSTAMP:20260302T080000Z', 'DTSTART:20260302T080000Z', 'DTEND:20260302T080000Z']
-    """
-    lines = ["BEGIN:VCALENDAR", "VERSION:2.0", "PRODID:-//reseau//schedule//EN"]
-    for each in events:
-        lines += [
-            "BEGIN:VEVENT", f"UID:{_escaped(each.uid)}", f"DTSTAMP:{_utc(stamp)}",
-            f"DTSTART:{_utc(each.start)}", f"DTEND:{_utc(each.end)}", f"SUMMARY:{_escaped(each.summary)}",
-            *([f"DESCRIPTION:{_escaped(each.description)}"] if each.description else []), "END:VEVENT",
-        ]  # fmt: skip
-    lines.append("END:VCALENDAR")
-    return "".join(f"{_folded(line)}\r\n" for line in lines)
 
 
 def _utc(time: datetime) -> str:

@@ -13,6 +13,7 @@ from pydantic import AwareDatetime, Field
 
 from ...calibration.assessment import Assessment
 from ...core.errors import ReseauError, UsageError
+from ..rules import Finding
 from .access import Administering, Here, NotFound, Operating, Reading
 from .answers import Answer, Done, Instant, refusals
 from .service import Service
@@ -56,14 +57,6 @@ class ConfigurationRow(Answer):
     to_review: int
 
 
-class FindingRow(Answer):
-    """What one rule found."""
-
-    rule: str
-    level: str
-    text: str
-
-
 class EarlierRow(Answer):
     """A judgement by an earlier version of the rules."""
 
@@ -87,7 +80,7 @@ class DecisionRow(Answer):
     by: str
     comment: str
     compared_with: str | None
-    findings: list[FindingRow]
+    findings: list[Finding]
     reviewed_by: str
     review: str
     comments: list[tuple[str, str]]

@@ -19,6 +19,7 @@ from ...core.errors import ReseauError
 from ...core.options import Declared, Group, options_of
 from ...core.vocabulary import names
 from ...io.photographs import PHOTOGRAPHS
+from ...report.template import environment
 from ..orders import BUSY
 from . import accounts, benches, calibrations, comparisons, history, operations, orders, sessions
 from .access import Administering, Here, NotFound, Reading, Unknown, csrf_of, principal_of, service_of
@@ -52,10 +53,7 @@ _RULES = {"version": 1, "image": {"warning": 0.1, "action": 0.3}}
 
 @cache
 def _templates() -> jinja2.Environment:
-    found = jinja2.Environment(
-        loader=jinja2.PackageLoader("reseau.service", "pages/app"), autoescape=True, trim_blocks=True,
-        lstrip_blocks=True, undefined=jinja2.StrictUndefined,
-    )  # fmt: skip
+    found = environment("reseau.service", "pages/app")
     found.filters |= {"plain": _plain, "powers": _powers, "symbol": _symbol, "sentence": _sentence}
     found.globals["vocabulary"] = names()
     return found
