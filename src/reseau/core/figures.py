@@ -65,6 +65,13 @@ def drawing() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def sheet(size: tuple[float, float], layout: Any = "constrained", **more: Any) -> Iterator[Figure]:
+    """Draw on a new figure in the common style, laid out by its content; the size is in inches."""
+    with drawing():
+        yield Figure(figsize=size, layout=layout, **more)
+
+
 def to_bytes(figure: Figure, kind: str, **options: Any) -> bytes:
     """Return the file of a figure, without dates: the same figure, the same bytes.
 

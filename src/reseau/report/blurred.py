@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
-from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing
+from ..core.figures import ACCENT, BLUE, FAINT, INK, sheet
 from ..measure.blurred.measure import BlurredResult
 from ..optics.formation import PixelResponse
 from ..optics.lenses import PupilElements, RayMap, ray_image
@@ -84,10 +84,8 @@ def _drawn(
     photograph: Array,
 ) -> Figure:
     """The four panels."""
-    from matplotlib.figure import Figure
 
-    with drawing():
-        figure = Figure(figsize=(11.0, 3.3), layout="constrained", facecolor="white")
+    with sheet((11.0, 3.3), facecolor="white") as figure:
         first, *others = figure.subplots(1, 4)
         for colour, xy, weight in zip((BLUE, INK, ACCENT, FAINT), spots[0], spots[1], strict=False):
             seen = weight > 0

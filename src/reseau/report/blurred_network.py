@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..core.data import Rows
-from ..core.figures import ACCENT, BLUE, FAINT, draw_arrows, drawing, nice, to_svg
+from ..core.figures import ACCENT, BLUE, FAINT, draw_arrows, nice, sheet, to_svg
 from ..core.numbers import plain
 from ..core.provenance import Provenance
 from ..procedures.blurred_network import BlurredNetwork, BlurredRound
@@ -88,8 +87,7 @@ def _residuals(found: BlurredNetwork, i: int) -> str:
         sizes.append(np.hypot(*v[np.isfinite(v).all(axis=1)].T))
     longest = float(np.max(np.concatenate(sizes), initial=0.0))
     enlarged = nice(0.12 * camera.width / longest) if longest > 0 else 1.0
-    with drawing():
-        figure = Figure(figsize=(8.6, 8.6 / 2 * camera.height / camera.width + 0.6), layout="constrained")
+    with sheet((8.6, 8.6 / 2 * camera.height / camera.width + 0.6)) as figure:
         for axes, entry, text in zip(
             figure.subplots(1, 2), (first, last), ("ordinary coordinates", "measured by rays"), strict=True
         ):

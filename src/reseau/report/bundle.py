@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from ..bundle import Result
 from ..bundle.diagnostics.fields import camera_mapping, projection_field_at
@@ -17,7 +16,7 @@ from ..calibration import CameraMapping, FieldDifference, projection_field
 from ..calibration.assessment import Assessment
 from ..core.data import Array, Frame, Rows
 from ..core.errors import UsageError
-from ..core.figures import ACCENT, FAINT, INK, draw_arrows, drawing, nice, to_svg
+from ..core.figures import ACCENT, FAINT, INK, draw_arrows, nice, sheet, to_svg
 from ..core.numbers import aligned, at_power, measured, plain, power
 from ..core.provenance import Provenance
 from ..io.photographs import Exif
@@ -576,8 +575,7 @@ def _figure(result: Result, pattern: CommonPattern, grouped: bool) -> str:
     enlarged = nice((0.1 if grouped else 0.04) * camera.width / typical)
     sure = pattern.p_at < _SURE
     width = 8.6 if across > 1 else 6.0
-    with drawing():
-        figure = Figure(figsize=(width, 0.5 + width * down * shape / across), layout="constrained")
+    with sheet((width, 0.5 + width * down * shape / across)) as figure:
         grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
         for axes in grid.flat[len(names) :]:
             axes.remove()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..bundle import Result
 from ..calibration import CameraMapping
@@ -18,9 +17,9 @@ from ..core.figures import (
     PALE,
     draw_arrows,
     draw_ellipses,
-    drawing,
     image_axes,
     nice,
+    sheet,
     to_svg,
 )
 from ..optics.cameras.registry import distortion_names
@@ -38,8 +37,7 @@ def network_figure(result: Result) -> str:
     values, part = result.fit.values, result.fit.usable
     points = np.flatnonzero(part.points)
     points = points[:: max(1, len(points) // _MANY_POINTS)].astype(np.intp)
-    with drawing():
-        figure = Figure(figsize=(8.6, 4.2), layout="constrained")
+    with sheet((8.6, 4.2)) as figure:
         for axes, (a, b), title in zip(
             figure.subplots(1, 2), ((0, 1), (0, 2)), ("plan", "elevation"), strict=True
         ):
@@ -85,8 +83,7 @@ def residual_figure(result: Result, c: int, rows: Rows) -> str:
     number = np.bincount(flat, minlength=across * down)
     total = np.stack([np.bincount(flat, v[:, k], across * down) for k in (0, 1)], axis=1)
     mean: Array = total / np.maximum(number, 1)[:, None]
-    with drawing():
-        figure = Figure(figsize=(8.6, 3.6), layout="constrained")
+    with sheet((8.6, 3.6)) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
         extent = (0, camera.width, camera.height, 0)
         left.imshow(number.reshape(down, across), extent=extent, cmap="Greys", alpha=0.35, aspect="equal")
@@ -116,8 +113,7 @@ def next_figure(result: Result, c: int, rows: Rows, assessed: Assessment) -> str
         return None
     xy = result.network.xy[rows]
     xy = xy[:: max(1, len(xy) // _MANY_POINTS)]
-    with drawing():
-        figure = Figure(figsize=(4.6, 0.9 + 4.0 * camera.height / camera.width), layout="constrained")
+    with sheet((4.6, 0.9 + 4.0 * camera.height / camera.width)) as figure:
         axes = figure.subplots()
         axes.plot(*xy.T, ".", color=FAINT, markersize=2.5, label="points so far")
         outline = np.array(then.outline_px)
@@ -153,8 +149,7 @@ def distortion_figure(lens: CameraMapping, errors: ErrorMap | None = None) -> tu
         return None
     at, curve, sigma, ideal = found
     by_angle = ideal is not None
-    with drawing():
-        figure = Figure(figsize=(8.6, 3.0), layout="constrained")
+    with sheet((8.6, 3.0)) as figure:
         left, right = figure.subplots(1, 2)
         left.fill_between(
             at, curve - _BAND * sigma, curve + _BAND * sigma, color=ACCENT, alpha=0.3, linewidth=0

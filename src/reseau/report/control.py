@@ -7,10 +7,9 @@ from datetime import datetime
 from typing import Any
 
 import matplotlib.dates as dates
-from matplotlib.figure import Figure
 
 from ..core.data import Array, Rows
-from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, to_svg
+from ..core.figures import ACCENT, BLUE, FAINT, INK, sheet, to_svg
 
 _HIGH, _WIDE, _LIMIT = 1.35, 8.6, 3.0
 
@@ -53,8 +52,7 @@ def control_figure(
     >>> control_figure(("c",), at, np.ones((2, 1)), none, none, np.zeros((2, 1), int))[:4]
     '<svg'
     """
-    with drawing():
-        figure = Figure(figsize=(_WIDE, 0.6 + _HIGH * len(names)), layout="constrained")
+    with sheet((_WIDE, 0.6 + _HIGH * len(names))) as figure:
         every: Any = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
         number: Any = dates.date2num(list(times))  # type: ignore[no-untyped-call]
         for k, axes in enumerate(every):

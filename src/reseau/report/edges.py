@@ -8,12 +8,11 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from ..core.data import Array
 from ..core.failure import Failure
-from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, image_axes, label_axes, to_svg
+from ..core.figures import ACCENT, BLUE, FAINT, INK, image_axes, label_axes, sheet, to_svg
 from ..core.overlay import Layer, declined_layers, draw_overlay
 from ..procedures.edges import Sharpness
 from ..sensor import EdgeSpread, FreeCurve
@@ -132,8 +131,7 @@ def _curves(found: Sharpness) -> str:
         chosen[id(order[len(order) // 2])] = (INK, "median")
     if len(order) == 1:
         chosen = {id(order[0]): (BLUE, "")}
-    with drawing():
-        figure = Figure(figsize=_SIZE, layout=ConstrainedLayoutEngine(wspace=0.06))
+    with sheet(_SIZE, layout=ConstrainedLayoutEngine(wspace=0.06)) as figure:
         left, right = figure.subplots(1, 2)
         left.axvline(0.5, color=FAINT, lw=0.6)
         for edge in order:
@@ -171,8 +169,7 @@ def _field(found: Sharpness) -> str:
     halves = np.array([half_of(edge) for edge in found.measured])
     shades = ScalarMappable(Normalize(halves.min(), halves.max()), "viridis")
     length = 0.025 * max(found.frame.width, found.frame.height)
-    with drawing():
-        figure = Figure(figsize=_FIELD, layout="constrained")
+    with sheet(_FIELD) as figure:
         axes = figure.subplots()
         for edge, half in zip(found.measured, halves, strict=True):
             along = edge.at.xy[1] - edge.at.xy[0]

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..calibration import FieldDifference
 from ..calibration.assessment import ErrorMap
 from ..calibration.camera import ProjectionField
 from ..core.data import Array
-from ..core.figures import FAINT, draw_contours, drawing, image_axes, to_svg
+from ..core.figures import FAINT, draw_contours, image_axes, sheet, to_svg
 
 _SIZE = (6.2, 4.6)
 """Inches."""
@@ -30,8 +29,7 @@ def uncertainty_figure(field: ProjectionField, points: Array | None = None) -> s
     str
         An SVG element.
     """
-    with drawing():
-        figure = Figure(figsize=_SIZE, layout="constrained")
+    with sheet(_SIZE) as figure:
         axes = figure.subplots()
         _dots(axes, points)
         draw_contours(axes, field.xy, field.sigma)
@@ -54,8 +52,7 @@ def difference_figure(found: FieldDifference) -> str:
     str
         An SVG element.
     """
-    with drawing():
-        figure = Figure(figsize=_SIZE, layout="constrained")
+    with sheet(_SIZE) as figure:
         found.plot(figure.subplots())
         return to_svg(figure)
 
@@ -75,8 +72,7 @@ def errors_figure(errors: ErrorMap, points: Array | None = None) -> str:
     str
         An SVG element.
     """
-    with drawing():
-        figure = Figure(figsize=(2 * _SIZE[0], _SIZE[1]), layout="constrained")
+    with sheet((2 * _SIZE[0], _SIZE[1])) as figure:
         for axes, formal in zip(figure.subplots(1, 2), (False, True), strict=True):
             _dots(axes, points)
             errors.plot(axes, formal=formal)

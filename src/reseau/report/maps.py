@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import scipy
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..core.data import Array, ImagePoints
 from ..core.figures import (
@@ -16,10 +15,10 @@ from ..core.figures import (
     Panel,
     beside,
     draw_ellipses,
-    drawing,
     length,
     nice,
     plane_axes,
+    sheet,
     to_svg,
 )
 
@@ -51,8 +50,7 @@ def body_map(true: ImagePoints, rods: Array, unit: str, errors: Array | None = N
     enlarged : float
         Factor of enlargement of the ellipses.
     """
-    with drawing():
-        figure = Figure(figsize=_SIZE, layout="constrained")
+    with sheet(_SIZE) as figure:
         axes = figure.subplots()
         enlarged = draw_body(axes, true, rods, unit, errors)
         axes.set_ylabel(f"$Y$ / {unit}")

@@ -7,13 +7,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..bundle import Result
 from ..bundle.diagnostics.fields import camera_mapping
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
-from ..core.figures import ACCENT, BLUE, Panel, draw_vectors, drawing, length, to_bytes
+from ..core.figures import ACCENT, BLUE, Panel, draw_vectors, length, sheet, to_bytes
 from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from ..refine import CorrectionFit
@@ -61,8 +60,7 @@ def overview_png(
     if fit is None or instrument.fit is None:
         raise UsageError("was read from a file and has no residuals", where="correction")
     unit = test_object.unit
-    with drawing():
-        figure = Figure(figsize=(10.4, 6.2), layout="constrained", facecolor="white")
+    with sheet((10.4, 6.2), facecolor="white") as figure:
         photos, results = figure.subplots(2, 3, height_ratios=(1, 1.16))
         _photo(photos[0], frames[0], first.points.xy, "PHOTO I: the reseau")
         _photo(photos[1], frames[1], second.pins.xy, "PHOTO II: a test object behind it")

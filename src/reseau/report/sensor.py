@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from ..core.data import Array
 from ..core.failure import Failure
-from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, label_axes, to_svg
+from ..core.figures import ACCENT, BLUE, FAINT, INK, label_axes, sheet, to_svg
 from ..core.provenance import Provenance
 from ..sensor import EdgeSpread, FreeCurve, Linearity
 from ..sensor.sensor import SensorResult
@@ -118,8 +117,7 @@ def mtf_figure(edge: EdgeSpread) -> str:
     str
         An SVG element.
     """
-    with drawing():
-        figure = Figure(figsize=_SIZE, layout=ConstrainedLayoutEngine(wspace=0.06))
+    with sheet(_SIZE, layout=ConstrainedLayoutEngine(wspace=0.06)) as figure:
         left, right = figure.subplots(1, 2)
         frequency = np.linspace(0.0, 1.0, 161)
         left.axvline(0.5, color=FAINT, lw=0.6)
@@ -166,8 +164,7 @@ def transfer_figure(result: SensorResult) -> str:
     """
     curve, fit = result.transfer.curve, result.transfer.fit
     lit, amount = curve.bright, curve.exposure_us / 1000 if curve.light is None else curve.light
-    with drawing():
-        figure = Figure(figsize=_SIZE, layout=ConstrainedLayoutEngine(wspace=0.06))
+    with sheet(_SIZE, layout=ConstrainedLayoutEngine(wspace=0.06)) as figure:
         left, right = figure.subplots(1, 2)
         signal: Array = np.linspace(0.0, float(curve.signal[curve.usable].max()) * 1.02, 81)
         linear, bend = (signal, np.ones_like(signal))
