@@ -13,6 +13,7 @@ from ..bundle.network.network import ControlPoints
 from ..core.errors import FormatError
 from ..io import read_text
 from ..io.network import TurntableEntry
+from .lines import is_number
 
 _COLUMNS = ["id", "x", "y", "z", "sx", "sy", "sz"]
 
@@ -50,7 +51,7 @@ def read_control(path: Path | str) -> ControlPoints:
     path = Path(path)
     lines = table_rows(read_text(path))
     header = [word.lower() for word in lines[0][1]] if lines else []
-    if lines and header not in (_COLUMNS[:4], _COLUMNS) and len(header) in (4, 7) and _is_number(header[1]):
+    if lines and header not in (_COLUMNS[:4], _COLUMNS) and len(header) in (4, 7) and is_number(header[1]):
         header = _COLUMNS[: len(header)]
     elif header in (_COLUMNS[:4], _COLUMNS):
         lines = lines[1:]
@@ -105,13 +106,6 @@ def table_rows(text: str) -> list[tuple[int, list[str]]]:
         if any(field.strip() for field in fields):
             rows.append((number, [field.strip() for field in fields]))
     return rows
-
-
-def _is_number(word: str) -> bool:
-    try:
-        return bool(np.isfinite(float(word)))
-    except ValueError:
-        return False
 
 
 def number_of(word: str, where: str) -> float:

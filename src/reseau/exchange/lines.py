@@ -34,6 +34,15 @@ def numbers(words: Sequence[str], count: int, path: Path, line: int) -> list[flo
     return values
 
 
+def is_number(word: str) -> bool:
+    """Whether a word is a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
 def read_bytes(path: Path, most_mb: int) -> bytes:
     """Content of a file of at most `most_mb` megabytes.
 

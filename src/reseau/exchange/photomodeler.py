@@ -25,7 +25,7 @@ from ..core.data import Array
 from ..core.errors import FormatError
 from ..io import read_text
 from ..optics.poses import angles_to_matrix, matrix_to_vector
-from .lines import network_of, numbers
+from .lines import is_number, network_of, numbers
 
 _FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
 
@@ -83,7 +83,7 @@ def read_photomodeler(path: Path | str) -> Network:
         list[str](),
     )
     kept = [_printed(default)]
-    while (words := lines.peek()) and len(words) >= 2 and not _is_number(words[1]):
+    while (words := lines.peek()) and len(words) >= 2 and not is_number(words[1]):
         ids.append(lines.next()[0])
         files.append(" ".join(words[1:]))
         poses.append(numbers(lines.next()[1:], 6, path, lines.number))
@@ -162,14 +162,6 @@ class _Lines:
             raise FormatError("the file is incomplete", where=self.path)
         self.number += 1
         return words
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _printed(values: list[float]) -> tuple[float, ...]:

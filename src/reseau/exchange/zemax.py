@@ -54,15 +54,9 @@ class _Listed:
 
     def value(self, key: str, default: float = 0.0, at: int = 0) -> float:
         """Return a number of a line; messages name the surface."""
-        words = self.lines.get(key)
-        if words is None:
+        if key not in self.lines:
             return default
-        try:
-            return finite(words[at])
-        except (IndexError, ValueError):
-            raise FormatError(
-                f"`{key} {' '.join(words)}` has no number", where=f"surface {self.number}"
-            ) from None
+        return _number(self.lines, key, at, where=f"surface {self.number}")
 
     def parameter(self, number: int) -> float:
         return self.value(f"PARM {number}")
@@ -219,15 +213,17 @@ def _named(at: _Listed) -> str:
     return f"surface {at.number}" + (f" ({comment})" if comment else "")
 
 
-def _number(header: dict[str, list[str]], key: str, at: int, default: float | None = None) -> float:
-    """Return a number of a line of the header, or the default where there is none."""
-    words = header.get(key, [])
+def _number(
+    lines: dict[str, list[str]], key: str, at: int, default: float | None = None, where: str | None = None
+) -> float:
+    """Return a number of a line, or the default where there is none."""
+    words = lines.get(key, [])
     if at >= len(words) and default is not None:
         return default
     try:
         return finite(words[at])
     except (IndexError, ValueError):
-        raise FormatError(f"`{key} {' '.join(words)}` has no number") from None
+        raise FormatError(f"`{key} {' '.join(words)}` has no number", where=where) from None
 
 
 def _wavelengths(header: dict[str, list[str]]) -> tuple[tuple[float, ...], tuple[float, ...], int]:

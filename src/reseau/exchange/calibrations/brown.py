@@ -14,6 +14,7 @@ from pathlib import Path
 from ...bundle import Camera
 from ...core.errors import FormatError
 from ..dbat import camera_of as dbat_camera
+from ..lines import is_number
 from ..markup import read_markup
 from ..photomodeler import camera_of_numbers
 from .plain import CENTRE, given
@@ -61,7 +62,7 @@ def write_photomodeler(camera: Camera) -> str:
 def is_photomodeler(text: str) -> bool:
     """Whether this is such a file."""
     lines = [line.split() for line in text.splitlines() if line.strip()]
-    counts = [_numbers(line) for line in lines[1:5]]
+    counts = [len(line) if all(map(is_number, line)) else -1 for line in lines[1:5]]
     return len(counts) >= 3 and counts[0] == _HEAD and counts[2] == _CAMERA_LINE
 
 
@@ -129,11 +130,3 @@ def is_micmac(text: str) -> bool:
 def _format(camera: Camera) -> tuple[float, float]:
     """Size of the image, mm."""
     return camera.width * camera.pitch_mm[0], camera.height * camera.pitch_mm[1]
-
-
-def _numbers(words: list[str]) -> int:
-    """Number of words, if all are numbers; otherwise -1."""
-    try:
-        return len([float(word) for word in words])
-    except ValueError:
-        return -1
