@@ -4,8 +4,8 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= out
 PIP    := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
-# More than processors: tests of drivers wait for time-outs.
-WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 2)')
+# One more than processors: tests of drivers wait for time-outs.
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 # Bytecode is kept, also where the environment says otherwise: workers, and commands that tests start, share it.
 export PYTHONDONTWRITEBYTECODE :=
 # What Debian's gir1.2-aravis-0.8 brings: GigE Vision and USB3 Vision.
@@ -16,13 +16,13 @@ ARAVIS  := $(wildcard /usr/lib/*/girepository-1.0/Aravis-0.8.typelib)
 demo: aravis
 	$(BIN)/reseau demo --out $(OUT)
 
-# Types are checked while tests wait. Tests that follow each other stay with one worker, and share what they compute
-# once, until another has nothing left to do.
+# Types are checked while tests wait. A file stays with one worker: what it computes once, and compiles, is not computed
+# twice.
 test: $(VENV)/.test
 	$(MAKE) -j 2 lint tests
 
 tests: $(VENV)/.test
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
