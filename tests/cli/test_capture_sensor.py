@@ -127,7 +127,7 @@ def test_every_raw_frame_is_archived_and_the_calibration_can_be_recomputed(
     assert run(["archive", "show", "monday", "--out", "results"]) == 0
     inputs = json.loads(Path("results/calibration.json").read_text())["provenance"]["inputs"]
     assert inputs == dict(kept)
-    assert "modulation transfer" in Path("results/report.html").read_text()
+    assert "Modulation transfer along the normal" in Path("results/report.html").read_text()
     capsys.readouterr()
     assert run(["archive", "rerun", "monday", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
