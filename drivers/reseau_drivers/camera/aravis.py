@@ -10,6 +10,7 @@ import math
 import os
 import shlex
 import socket
+import sys
 import time
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
@@ -41,6 +42,8 @@ from .gvcp import HEARTBEAT_S, controlled_elsewhere, is_ip, require_answer, requ
 
 _UNKNOWN_PERIOD_NS = 1_000_000_000
 _RELEASE_S = 0.5
+_MOST_BUFFERED = 1 << 30
+"""Bytes that a socket buffers at most."""
 _SO_RCVBUFFORCE = 33
 """Of Linux; Python's socket does not name it."""
 _OUTLIVING_S = 0.1
@@ -398,7 +401,7 @@ class Aravis:
                 raise RefusedError("does not open a stream", do="is it open in another program?")
             payload = camera.get_payload()
             if camera.is_gv_device():
-                _widen(self._stream, 4 * payload)
+                _widen(self._stream, min(4 * payload, _MOST_BUFFERED))
             for _ in range(self._settings.buffers):
                 self._stream.push_buffer(_library()[0].Buffer.new_allocate(payload))
             camera.start_acquisition()
@@ -644,9 +647,9 @@ def _widen(stream: Any, size: int) -> None:
     stream.set_property("socket-buffer-size", 0)  # the library leaves it alone
     for each in psutil.Process().net_connections("udp4"):
         if each.laddr and each.laddr.port == stream.get_port():
-            with socket.socket(fileno=os.dup(each.fd)) as same:
+            with suppress(OSError), socket.socket(fileno=os.dup(each.fd)) as same:
                 same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
-                with suppress(OSError):
+                if sys.platform == "linux":
                     same.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
 
 
