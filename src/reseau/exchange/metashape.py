@@ -19,7 +19,7 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,7 +35,6 @@ from .markup import Node, read_markup
 
 _RADIAL = ("k1", "k2", "k3", "k4")
 _DISTORTION = (*_RADIAL, "p1", "p2")
-_VALUES = ("f", "fx", "fy", "cx", "cy", "b1", "b2", "skew", *_DISTORTION, "p3", "p4")
 _MOST_MB = 1000
 # Metashape's own, where the file has none: image points of markers and of tie points (px), markers (m).
 _ACCURACY = {"accuracy_projections": 0.5, "accuracy_tiepoints": 1.0, "accuracy_markers": 0.005}
@@ -369,57 +368,16 @@ def _camera(sensor: Node, corner: bool) -> Camera:
     properties, name = _properties(sensor), sensor.get("label") or sensor.attribute("id")
     size = sensor.need("resolution")
     width, height = int(size.number("width")), int(size.number("height"))
+    where, values = sensor.where, dict[str, float]()
     kind = sensor.get("type", "frame")
     if given is not None:
-        values = values_of(given)
-        return camera_of(
-            name, (width, height), given.get("type", kind), values, given.where, properties, corner
-        )
-    values = dict.fromkeys(_VALUES, 0.0)
-    if "focal_length" in properties and float(properties.get("pixel_width") or 0) > 0:
+        kind, where = given.get("type", kind), given.where
+        for key in ("f", "fx", "fy", "cx", "cy", "b1", "b2", "skew", *_DISTORTION, "p3", "p4"):
+            values[key] = given.value(key, 0.0)
+    elif "focal_length" in properties and float(properties.get("pixel_width") or 0) > 0:
         values["f"] = float(properties["focal_length"]) / float(properties["pixel_width"])
-    return camera_of(name, (width, height), kind, values, sensor.where, properties, corner)
-
-
-def values_of(given: Node) -> dict[str, float]:
-    """Return the values of a calibration by their names, zero where it has none."""
-    return {key: given.value(key, 0.0) for key in _VALUES}
-
-
-def camera_of(
-    name: str,
-    size: tuple[int, int],
-    kind: str,
-    values: Mapping[str, float],
-    where: object,
-    properties: Mapping[str, str],
-    corner: bool = False,
-) -> Camera:
-    """Return the camera of a calibration.
-
-    Parameters
-    ----------
-    name : str
-        Its name.
-    size : (int, int)
-        Width and height, px.
-    kind : str
-        Projection; ``frame`` and ``fisheye`` are read.
-    values : mapping of str to float
-        See :func:`values_of`.
-    where : object
-        Names the file in messages.
-    properties : mapping of str to str
-        Those of the sensor.
-    corner : bool
-        Whether the principal point of an old file is that from the corner.
-
-    Raises
-    ------
-    FormatError
-        When it has no focal length, or what no camera of this project describes.
-    """
-    width, height = size
+    values = {key: values.get(key, 0.0) for key in ("f", "fx", "fy", "cx", "cy", "b1", "b2", "skew",
+                                                    *_DISTORTION, "p3", "p4")}  # fmt: skip
     old = values["fx"] > 0
     fx, fy = (values["fx"], values["fy"]) if old else (values["f"] + values["b1"], values["f"])
     if not (fx > 0 and fy > 0):
@@ -445,7 +403,7 @@ def camera_of(
 
 
 def _refuse(
-    kind: str, values: Mapping[str, float], properties: Mapping[str, str], affine: bool, where: object
+    kind: str, values: dict[str, float], properties: dict[str, str], affine: bool, where: str
 ) -> None:
     """Refuse what no registered camera describes."""
     what = ""

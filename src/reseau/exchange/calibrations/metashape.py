@@ -13,12 +13,15 @@ A fisheye (in newer versions also called equidistant fisheye) has x·θ/r, y·θ
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
+from xml.etree import ElementTree
 
 from ...bundle import Camera
-from ..markup import read_markup
-from ..metashape import camera_of, values_of
-from .plain import given
+from ...core.errors import FormatError
+from .plain import given, opencv_camera
+
+_FISHEYE = ("fisheye", "equidistant_fisheye")
 
 
 def write(camera: Camera) -> str:
@@ -55,11 +58,29 @@ def read(text: str, path: Path) -> Camera:
     Raises
     ------
     FormatError
-        When it is that of another projection, is incomplete, or has what no camera here describes; see
-        :func:`reseau.exchange.metashape.read_metashape`.
+        When it is that of another projection, is incomplete, or has skew, K4 of a frame camera, or P1 and P2
+        of a fisheye, which OpenCV's models lack.
     """
-    root = read_markup(path, text.lstrip("\ufeff").encode())
-    given = root if root.tag == "calibration" else root.need(".//calibration")
-    size = int(given.value("width")), int(given.value("height"))
-    kind = given.need("projection").text.removeprefix("equidistant_")
-    return camera_of(path.stem, size, kind, values_of(given), path, {"fixed": "true"})
+    try:
+        root = ElementTree.fromstring(text.lstrip("\ufeff"))
+    except ElementTree.ParseError:
+        raise FormatError("is not XML", where=path) from None
+    found = {element.tag: (element.text or "").strip() for element in root.iter()}
+    if found.get("projection") not in ("frame", *_FISHEYE):
+        what = f"has the projection {found.get('projection')!r}, not 'frame' or 'fisheye'"
+        raise FormatError(what, where=path)
+    fisheye = found["projection"] in _FISHEYE
+    try:
+        width, height = int(found["width"]), int(found["height"])
+        f = float(found["f"])
+        names = ("cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+        cx, cy, b1, b2, k1, k2, k3, k4, p1, p2 = (float(found.get(name) or 0.0) for name in names)
+    except (KeyError, ValueError):
+        raise FormatError("has no complete width, height and f", where=path) from None
+    lacking = {"B2": b2, "P1 or P2 of a fisheye": p1 or p2} if fisheye else {"B2": b2, "K4": k4}
+    for what, value in lacking.items():
+        if value and isfinite(value):
+            raise FormatError(f"has {what}, which cannot be read", where=path, do="export it without")
+    centre = cx + width / 2 - 0.5, cy + height / 2 - 0.5
+    given = (k1, k2, k3, k4) if fisheye else (k1, k2, p2, p1, k3)
+    return opencv_camera(path.stem, (width, height), (f + b1, f), centre, given, path, fisheye=fisheye)
