@@ -358,7 +358,7 @@ def test_the_feed_is_read_by_another_program(schedules: Schedules) -> None:
     assert len({str(each["uid"]) for each in found}) == 7
     schedules.add(WEEKLY.model_copy(update={"name": "a\\b;c,d\ne"}), week(0))
     event, *_ = icalendar.Calendar.from_ical(schedules.feed("a\\b;c,d\ne", week(0))).walk("VEVENT")
-    assert str(event["summary"]).startswith("a\\b;c,d\ne: ")
+    assert str(event["summary"]) == "a\\b;c,d\ne: due"
 
 
 def test_a_schedule_is_checked_when_it_is_read() -> None:

@@ -154,7 +154,7 @@ def _with_settings(
     """Return the network with what the user sets."""
     from ..bundle.network.settings import with_control, with_datum, with_parameters, with_sigma
     from ..core.errors import UsageError
-    from ..exchange.control import read_control
+    from ..exchange.tables import read_control
 
     network = with_parameters(network, free, fix)
     if control is not None:

@@ -193,7 +193,7 @@ class _Adjustment:
             When an option cannot be interpreted.
         """
         from ..bundle import Options
-        from ..exchange.control import read_control, read_turntable
+        from ..exchange.tables import read_control, read_turntable
         from ..io.refraction import RefractionFile
         from ..procedures.calibration_options import CalibrationOptions
 

@@ -1,27 +1,24 @@
-"""What the report of simulated photographs has besides: an overview, and a camera of a testfield."""
+"""An overview of the procedure in one figure: the photographs, and below each its result."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from ..bundle import Result
-from ..bundle.diagnostics.fields import camera_mapping
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
-from ..core.figures import ACCENT, BLUE, Panel, draw_vectors, length, sheet, to_bytes
+from ..core.figures import ACCENT, BLUE, Panel, draw_vectors, drawing, length, to_bytes
 from ..io import ReseauDesign
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from ..refine import CorrectionFit
-from .bundle_figures import distortion_figure, network_figure
 from .figures import draw_distortion
 from .maps import draw_body
 from .overlay import preview
 from .photo_iii import errors_of
-from .tables import Row, rms, symbol
+from .tables import rms
 from .truth import Comparison
 
 
@@ -60,7 +57,8 @@ def overview_png(
     if fit is None or instrument.fit is None:
         raise UsageError("was read from a file and has no residuals", where="correction")
     unit = test_object.unit
-    with sheet((10.4, 6.2), facecolor="white") as figure:
+    with drawing():
+        figure = Figure(figsize=(10.4, 6.2), layout="constrained", facecolor="white")
         photos, results = figure.subplots(2, 3, height_ratios=(1, 1.16))
         _photo(photos[0], frames[0], first.points.xy, "PHOTO I: the reseau")
         _photo(photos[1], frames[1], second.pins.xy, "PHOTO II: a test object behind it")
@@ -100,42 +98,3 @@ def _body(axes: Axes, third: PhotoIII, test_object: ReseauDesign, truth: Compari
     errors = None if known is None else errors_of(third, known)
     enlarged = draw_body(axes, third.true, test_object.xy, test_object.unit, errors, named=False)
     axes.set_title(f"true coordinates, ellipses {enlarged:g} times enlarged", loc="left")
-
-
-def camera_section(result: Result, images: int, true: Mapping[str, float]) -> Row:
-    """Return the content of the section's template.
-
-    Parameters
-    ----------
-    result : Result
-        Result of the bundle adjustment of one camera.
-    images : int
-        Number of frames.
-    true : mapping of str to float
-        True parameters of the simulator.
-    """
-    names, _, values = result.camera_columns(0)
-    sigma = np.sqrt(np.diag(result.camera_covariance(0)))
-    rows = [
-        (symbol(name), *_alike(value, s, true[name]), f"{(value - true[name]) / s:+.2f}")
-        for name, value, s in zip(names, values, sigma, strict=True)
-    ]
-    errors = np.array([float(row[-1]) for row in rows])
-    profile = distortion_figure(camera_mapping(result, 0))
-    return {
-        "images": images,
-        "points": len(result.network.xy),
-        "sigma0": f"{result.sigma0:.3f}",
-        "redundancy": result.redundancy,
-        "rows": rows,
-        "rms": f"{np.sqrt(np.mean(errors**2)):.2f}",
-        "network": Markup(network_figure(result)),
-        "distortion": None if profile is None else Markup(profile[0]),
-        "distortion_of": "" if profile is None else profile[1],
-    }
-
-
-def _alike(*values: float) -> tuple[str, ...]:
-    """Estimate, sigma and truth with two digits of the sigma."""
-    decimals = max(0, 1 - int(np.floor(np.log10(values[1]))))
-    return tuple(f"{value:.{decimals}f}" for value in values)

@@ -58,7 +58,7 @@ def oscilloscope_report(
     truth : Comparison, optional
         Comparison with the truth of a simulator.
     camera : dict, optional
-        A camera calibrated in another session; see :func:`~reseau.report.overview.camera_section`.
+        A camera calibrated in another session; see :func:`~reseau.report.camera.camera_section`.
 
     Returns
     -------

@@ -342,7 +342,8 @@ def _compared(done: OscilloscopeSession) -> Comparison:
 def _documents(demo: Demo, seed: int) -> dict[str, str | bytes]:
     """All files besides the photographs, by name."""
     from ..report import oscilloscope_report
-    from ..report.overview import camera_section, overview_png
+    from ..report.camera import camera_section
+    from ..report.overview import overview_png
 
     done, field, truth = demo.oscilloscope, demo.testfield, demo.comparison
     bench, provenance = done.world, _provenance(done, seed)
