@@ -36,6 +36,7 @@ settings.load_profile("untimed")
 
 _AROUND = {"cameras", "capture", "cli", "exchange", "http", "service", "sessions", "tests"}
 """Folders of tests of what is done with calibrations."""
+collect_ignore = ["capture/loaded.py"]
 _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 

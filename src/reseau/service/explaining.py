@@ -30,6 +30,8 @@ _YEAR = 365.25
 """Period of seasons, days."""
 _SEASONS = np.linspace(0.0, _YEAR, 25)
 """Times ahead at which a drift that follows the seasons is predicted, days."""
+_PHASES = np.linspace(0.0, np.pi, 12, endpoint=False)
+"""Phases of the year at the reference; the field may have either sign."""
 _WIDTHS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
 """Sizes τ of changes (rms over the image), in limits, all equally probable."""
 
@@ -293,66 +295,58 @@ def _all_supposed(runs: RunHistory, common: Array, limit: float, in_force: int) 
 def _supposed(
     kind: int, shapes: Array, growth: Array, runs: RunHistory, limit: float, common: Array, in_force: int
 ) -> _Supposed:
-    """Changes of shapes (k, p, n), each a field of random direction and size for every function of time."""
-    k, p, r = *shapes.shape[:2], runs.values.shape[1]
+    """Changes of shapes (k, n): a field of random direction and size, times a function of time."""
     precision, base, _ = runs.mean()
-    weighted = np.einsum("nij,nj->ni", precision, runs.values - base)
-    one = np.einsum("kpn,nij->kpij", shapes, precision)
-    both = np.einsum("kpn,kqn,nij->kpiqj", shapes, shapes, precision)
-    both -= np.einsum("kpia,ab,kqbj->kpiqj", one, np.linalg.inv(precision.sum(axis=0)), one)
-    right = np.einsum("kpn,ni->kpi", shapes, weighted)
+    one = np.einsum("kn,nij->kij", shapes, precision)
+    both = np.einsum("kn,nij->kij", shapes**2, precision)
+    both -= np.einsum("kia,ab,kbj->kij", one, np.linalg.inv(precision.sum(axis=0)), one)
+    right = np.einsum("kn,nij,nj->ki", shapes, precision, runs.values - base)
     sigma = runs.spreads(limit)
-    scaled = np.einsum("ai,kpiqj,aj->akpiqj", sigma, both, sigma).reshape(2, k, p * r, p * r)
-    known, u = np.linalg.eigh(scaled)
-    h = np.einsum("akji,akj->aki", u, np.einsum("ai,kpi->akpi", sigma, right).reshape(2, k, p * r))
+    known, u = np.linalg.eigh(np.einsum("ai,kij,aj->akij", sigma, both, sigma))
+    h = np.einsum("akji,aj,kj->aki", u, sigma, right)
     s, tau = _SCALES[:, None, None], _WIDTHS[:, None]
     at = (slice(None), slice(None), None, None)
     cov = 1 / (np.maximum(known, 0.0)[at] / s**2 + 1 / tau**2)
     mean = h[at] / s**2 * cov
     log = 0.5 * (h[at] / s**2 * mean + np.log(cov) - 2 * np.log(tau)).sum(axis=-1)
-    log = log + common[:, None] - np.log(2 * k * len(_WIDTHS))
-    to_field = u.reshape(2, k, p, r, p * r)
+    log = log + common[:, None] - np.log(2 * len(shapes) * len(_WIDTHS))
+    fields = np.einsum("mci,ai,akij->akmcj", runs.basis, sigma, u, optimize=True)
+    sizes = _greatest(fields, mean, cov).reshape(2, 2, len(shapes), -1)
 
-    def sizes(part: Array) -> Array:
-        """Largest changes over the image, and their standard deviations, of parts (k, p) of the functions."""
-        u = np.broadcast_to(to_field, (2, len(part), *to_field.shape[2:]))
-        fields = np.einsum("mci,ai,kp,akpij->akmcj", runs.basis, sigma, part, u, optimize=True)
-        return _greatest(fields, *(np.broadcast_to(e, (2, len(part), *e.shape[2:])) for e in (mean, cov)))
+    def grown(part: Array) -> Array:
+        """Changes and standard deviations where the functions have grown by parts (…, k)."""
+        found = np.abs(part)[..., None, :, None] * sizes.reshape(2, *(1,) * (part.ndim - 1), *sizes.shape[1:])
+        return np.asarray(found.reshape(*found.shape[:-3], -1))
 
-    now, count = shapes[:, :, -1], len(_SCALES) * len(_WIDTHS)
-    if p == 1:  # what is said of one function is in proportion
-        total = sizes(now)
-        step = total * np.tile(np.repeat(np.abs(now - shapes[:, :, in_force])[:, 0], count), 2)
-    else:
-        total, step = sizes(now), sizes(now - shapes[:, :, in_force])
+    count = len(_SCALES) * len(_WIDTHS)
     scale = np.broadcast_to(_SCALES[:, None], log.shape).ravel()
-    made = _Supposed(kind, log.ravel(), scale, total, step, np.tile(np.repeat(growth, count), 2))
+    made = _Supposed(
+        kind, log.ravel(), scale, grown(shapes[:, -1]), grown(shapes[:, -1] - shapes[:, in_force]),
+        np.tile(np.repeat(growth, count), 2),
+    )  # fmt: skip
     if kind != 3:
         return made
-    ahead = sizes(_season(runs.days[-1] - runs.days[0] + _SEASONS).T).reshape(2, 2, len(_SEASONS), count)
-    return replace(made, ahead=ahead.swapaxes(1, 2).reshape(2, len(_SEASONS), -1))
+    return replace(made, ahead=grown(_seasons(runs.days[-1] - runs.days[0] + _SEASONS).T))
 
 
 def _profiles(days: Array) -> dict[int, tuple[Array, Array]]:
-    """Functions of time (k, p, n), 0 at the reference, and the growth (k,) a day of what creeps.
+    """Functions of time (k, n), 0 at the reference, and the growth (k,) a day of what creeps.
 
     Kinds: 1 creeping, 2 at once, 3 with the seasons.
     """
     n = len(days)
     left = days[-1] - days[: max(1, n - 2)]
-    rising = np.maximum(0.0, days - days[: len(left), None]) / left[:, None]
     at_once = np.array([np.arange(n) >= k for k in range(1, n)], dtype=np.float64)
-    found = {2: (at_once[:, None], np.zeros(n - 1))}
+    found = {2: (at_once, np.zeros(n - 1))}
     if n > 2:
-        found[1] = rising[:, None], 1 / left
-        found[3] = _season(days)[None], np.zeros(1)
+        found[1] = np.maximum(0.0, days - days[: len(left), None]) / left[:, None], 1 / left
+        found[3] = _seasons(days), np.zeros(len(_PHASES))
     return found
 
 
-def _season(days: Array) -> Array:
-    """The functions (2, n) of time of what follows the seasons, 0 at the reference."""
-    year = 2 * np.pi * days / _YEAR
-    return np.array([np.sin(year), 1 - np.cos(year)])
+def _seasons(days: Array) -> Array:
+    """The functions (k, n) of time of what follows one temperature of the year, 0 at the reference."""
+    return np.asarray(np.sin(2 * np.pi * days / _YEAR + _PHASES[:, None]) - np.sin(_PHASES)[:, None])
 
 
 def _greatest(fields: Array, mean: Array, cov: Array) -> Array:
