@@ -11,7 +11,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # What Debian's gir1.2-aravis-0.8 brings: GigE Vision and USB3 Vision.
 ARAVIS  := $(wildcard /usr/lib/*/girepository-1.0/Aravis-0.8.typelib)
 
-.PHONY: demo test tests lint docs rig slow bench bench-compare aravis clean
+.PHONY: demo test tests lint examples docs rig slow bench bench-compare aravis clean
 
 demo: aravis
 	$(BIN)/reseau demo --out $(OUT)
@@ -31,10 +31,14 @@ lint: $(VENV)/.test
 	$(BIN)/lint-imports
 
 # The site: guides, mathematics, decisions and the reference of the API, in build/docs; warnings are errors.
-docs: $(VENV)/.docs
+docs: $(VENV)/.docs examples
 	rm -rf docs/api/generated docs/examples
 	$(BIN)/python -m sphinx -b html -W --keep-going -q -d build/doctrees docs build/docs
 	@echo build/docs/index.html
+
+# The examples of the reference.
+examples: $(VENV)/.test
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --doctest-modules src drivers sims
 
 rig: $(VENV)/.test
 	$(BIN)/python -m tests.rig.machine

@@ -315,10 +315,11 @@ class UdpServer(Server):
 
     def _bind(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         self._socket.bind((self.HOST, self.port))
         self.port = int(self._socket.getsockname()[1])
         self._peer = None
-        self._add(self._socket.fileno(), self._socket.close)
+        self._add(self._socket.fileno(), lambda: None)
 
     @property
     def address(self) -> str:
@@ -344,10 +345,12 @@ class UdpServer(Server):
         return self._socket.sendto(data[:_LARGEST_SENT], self._peer)
 
     def _after_loss(self) -> None:
-        self._bind()
+        # Nobody else gets the port meanwhile.
+        with self._socket:
+            self._bind()
 
     def _release(self) -> None:
-        """Do nothing: the socket is the connection."""
+        self._socket.close()
 
 
 class PtyServer(Server):
