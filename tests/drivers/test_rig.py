@@ -120,24 +120,28 @@ def test_cameras_expose_at_once_and_the_skew_is_what_it_truly_was(
     assert all(each.body.violations == [] for each in wired.served)
 
 
-def test_a_line_that_others_pulse_exposes_all_cameras(make: Make) -> None:
+def test_a_line_that_others_pulse_exposes_all_cameras_by_the_same_pulse(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     wired = make(2, "hardware", "hardware")
-    with ExitStack() as stack:
-        ended = threading.Event()
 
-        def pulse() -> None:
-            while not ended.wait(0.05):
-                for each in wired.served:
-                    each.pulse()
+    def pulse() -> None:
+        for each in wired.served:
+            each.pulse()
 
-        pulsing = threading.Thread(target=pulse)
-        pulsing.start()
-        stack.callback(pulsing.join)
-        stack.callback(ended.set)
-        for _ in range(5):
-            skew, within = wired.rig.expose_all().skew
-            # The second camera starts 0.7 ms later; frames of different pulses would be 50 ms apart.
-            assert abs(skew - 0.7e-3) < 0.02 + within
+    timers = list[threading.Timer]()
+
+    def later() -> None:
+        timers.append(threading.Timer(0.05, pulse))
+        timers[-1].start()
+
+    monkeypatch.setattr(wired.rig, "_fire", later)
+    for _ in range(12):
+        pulse()  # when all wait before it, or only the slower camera does
+        skew, within = wired.rig.expose_all().skew
+        # The second camera starts 0.7 ms later; frames of different pulses would be 50 ms apart.
+        assert abs(skew - 0.7e-3) < 0.02 + within
+        timers[-1].join()
 
 
 def test_an_action_command_of_another_key_exposes_nothing(make: Make) -> None:

@@ -418,20 +418,17 @@ class Aravis:
         while triggered and (buffer := self._stream.try_pop_buffer()) is not None:
             self._counted(buffer)
             self._stream.push_buffer(buffer)
-        # Who is triggered by the others of a rig is so after this, however late this thread goes on.
-        waiting = time.monotonic_ns()
-        by_rig = ready is not None and ready()
-        self._stamps.triggered = None
+        # What counts for the rig is when all waited, however late this thread goes on.
+        since, by_rig = (time.monotonic_ns(), False) if ready is None else ready()
+        self._stamps.triggered = since if triggered and by_rig else None
         if self._settings.trigger == "software":
             self._stamps.triggered = time.monotonic_ns()
             with self._translated_errors("trigger") as camera:
                 camera.software_trigger()
-        elif triggered and by_rig:
-            self._stamps.triggered = waiting
         elif self._settings.trigger == "action" and ready is None:
             self._stamps.triggered = time.monotonic_ns()
             send_action([self.host], self._settings.action)
-        return self._stamps.triggered or time.monotonic_ns()
+        return self._stamps.triggered or since
 
     def take(self, deadline: Deadline) -> RawFrame | None:
         """Return the next complete frame that is newer than the last."""

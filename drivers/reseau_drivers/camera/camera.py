@@ -22,9 +22,34 @@ from .features import Feature, differences, matching
 
 _SLICE_S = 0.05
 """Time to wait for a frame before checking for a stop request (s)."""
-Ready = Callable[[], bool]
+Ready = Callable[[], tuple[int, bool]]
+"""Since when all cameras of a rig wait (monotonic clock, ns), and whether they are triggered for it."""
 _CHECKED = 12
 """Number of frames from which :meth:`CameraDriver.check` computes the frame rate."""
+
+
+class Together(Protocol):
+    """What the cameras of a rig wait in for each other."""
+
+    def wait(self) -> tuple[int, bool]:
+        """Wait until all cameras wait for their trigger, before a software trigger is sent.
+
+        Returns
+        -------
+        int, bool
+            Since when all wait (monotonic clock, ns), and whether this, or what follows, triggers the camera.
+        """
+
+    def agrees(self, began: TimeInterval, before: TimeInterval | None) -> bool:
+        """Wait until all cameras have a frame; return whether this one was exposed with those of the others.
+
+        Parameters
+        ----------
+        began : TimeInterval
+            Start of its exposure.
+        before : TimeInterval, optional
+            That of the last frame before it, which had begun too early.
+        """
 
 
 @dataclass(frozen=True)
@@ -387,16 +412,15 @@ class CameraDriver(Device[S]):
             f"{self.name}_dropped": {"dtype": "integer", "shape": []},
         }
 
-    def expose(self, seconds: float | None = None, *, ready: Ready | None = None) -> CameraExposure:
+    def expose(self, seconds: float | None = None, *, together: Together | None = None) -> CameraExposure:
         """Return a frame whose exposure started after this call.
 
         Parameters
         ----------
         seconds : float, optional
             Time limit (s).
-        ready : callable, optional
-            Called as soon as the camera waits for its trigger, before a software trigger is sent; cameras of
-            a rig wait in it for each other. Returns whether it, or what follows it, triggers the camera.
+        together : Together, optional
+            What cameras of a rig wait in for each other, and choose their frames by.
 
         Raises
         ------
@@ -411,7 +435,7 @@ class CameraDriver(Device[S]):
         """
         self._begin("expose")
         with self._exchange("expose", seconds) as deadline:
-            return self._next(deadline, stale=False, ready=ready)
+            return self._next(deadline, stale=False, together=together)
 
     def frames(self, count: int, seconds: float | None = None) -> Iterator[CameraExposure]:
         """Yield consecutive frames as the camera delivers them; each states whether it is fresh.
@@ -434,17 +458,21 @@ class CameraDriver(Device[S]):
                 shot = self._next(deadline, stale=True)
             yield shot
 
-    def _next(self, deadline: Deadline, *, stale: bool, ready: Ready | None = None) -> CameraExposure:
+    def _next(self, deadline: Deadline, *, stale: bool, together: Together | None = None) -> CameraExposure:
         self._source.start(deadline)
-        asked, passed = self._source.request(deadline, ready), 0
+        asked, passed = self._source.request(deadline, None if together is None else together.wait), 0
+        before: TimeInterval | None = None
         while True:
             if self._stopping.is_set():
                 raise StateError("was stopped")
             taken = self._source.take(deadline.part(_SLICE_S))
             if taken is not None:
                 fresh = taken.began.earliest >= asked
+                if fresh and together is not None and not together.agrees(taken.began, before):
+                    fresh, together = False, None
                 if fresh or stale:
                     return self._shot(taken, fresh)
+                before = taken.began
                 self.skipped += 1
                 passed += 1
             if deadline.expired:

@@ -23,6 +23,11 @@ class TimeInterval:
     earliest: int
     latest: int
 
+    @property
+    def middle(self) -> int:
+        """The most probable start."""
+        return (self.earliest + self.latest) // 2
+
 
 def realtime_offset() -> tuple[int, int]:
     """Return the offset from the monotonic clock to UTC and its uncertainty (ns).
@@ -40,7 +45,7 @@ def realtime_offset() -> tuple[int, int]:
 def utc(span: TimeInterval) -> tuple[datetime, float]:
     """Return the middle of an interval in UTC, and half of its width (s)."""
     offset, doubt = realtime_offset()
-    middle = (span.earliest + span.latest) // 2 + offset
+    middle = span.middle + offset
     half = (span.latest - span.earliest) / 2 + doubt + 1000  # datetime counts microseconds
     return _EPOCH + timedelta(microseconds=middle // 1000), half * 1e-9
 

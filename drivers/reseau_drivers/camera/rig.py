@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import inspect
 import threading
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -29,6 +30,7 @@ from reseau.instruments import (
 )
 
 from .camera import CameraExposure
+from .clocks import TimeInterval
 from .gvcp import send_action
 
 
@@ -120,7 +122,7 @@ class Rig(Device[RigSettings]):
             found: Any = instruments.get(each)
             if not isinstance(found, Camera):
                 raise SettingError(f"{each!r} is not a camera on this bench", where=self.name)
-            if "ready" not in inspect.signature(found.expose).parameters:
+            if "together" not in inspect.signature(found.expose).parameters:
                 raise SettingError(f"the driver of {each!r} cannot be part of a rig", where=self.name)
             self._members[each] = found
         self._require_triggers(self._settings)
@@ -173,25 +175,17 @@ class Rig(Device[RigSettings]):
             return self._exposed(deadline)
 
     def _exposed(self, deadline: Deadline) -> ExposureSet:
-        barrier = threading.Barrier(len(self._members), self._fire)
         fired = self._settings.trigger == "action" or self._leads_by_software()
+        exposure = _OneExposure(len(self._members), deadline, self._fire, fired)
 
         def expose(name: str) -> CameraExposure:
-            passed = False
-
-            def ready() -> bool:
-                nonlocal passed
-                barrier.wait(deadline.left)
-                passed = True
-                return fired
-
+            member = _Member(name, exposure)
             try:
-                shot: CameraExposure = self._members[name].expose(deadline.left, ready=ready)
+                shot: CameraExposure = self._members[name].expose(deadline.left, together=member)
             except threading.BrokenBarrierError:
                 raise _Unready("was not triggered: another camera was not ready", where=name) from None
             finally:
-                if not passed:
-                    barrier.abort()  # the others would wait for it
+                member.leave()
             return shot
 
         with ThreadPoolExecutor(len(self._members), self.name) as pool:
@@ -260,3 +254,52 @@ class Rig(Device[RigSettings]):
 
 class _Unready(StateError):
     """A camera that was not triggered, because another one failed."""
+
+
+class _OneExposure:
+    """Where the cameras of a rig wait for each other, and the starts of their exposures."""
+
+    def __init__(self, count: int, deadline: Deadline, fire: Callable[[], None], fired: bool) -> None:
+        self.deadline, self.fired, self.since = deadline, fired, 0
+        self.starts = dict[str, tuple[TimeInterval, TimeInterval | None]]()
+        self._fire = fire
+        self.ready, self.seen = threading.Barrier(count, self._all_wait), threading.Barrier(count)
+
+    def _all_wait(self) -> None:
+        self.since = time.monotonic_ns()
+        self._fire()
+
+
+class _Member:
+    """A camera of a rig during an exposure; implements :class:`~reseau_drivers.camera.camera.Together`."""
+
+    def __init__(self, name: str, exposure: _OneExposure) -> None:
+        self._name, self._exposure = name, exposure
+        self._ahead = [exposure.ready, exposure.seen]
+
+    def _pass(self) -> None:
+        self._ahead[0].wait(self._exposure.deadline.left)
+        del self._ahead[0]
+
+    def wait(self) -> tuple[int, bool]:
+        self._pass()
+        return self._exposure.since, self._exposure.fired
+
+    def agrees(self, began: TimeInterval, before: TimeInterval | None) -> bool:
+        # A pulse of others may have come when only some cameras waited, or while delays of triggers differ:
+        # where a frame is nearer to one that another camera passed over, it belongs to the pulse before.
+        if self._exposure.fired:
+            return True
+        starts = self._exposure.starts
+        starts[self._name] = began, before
+        self._pass()
+        return all(
+            passed is None or abs(began.middle - own.middle) <= abs(began.middle - passed.middle)
+            for name, (own, passed) in starts.items()
+            if name != self._name
+        )
+
+    def leave(self) -> None:
+        """Let nobody wait for this camera."""
+        for each in self._ahead:
+            each.abort()

@@ -259,9 +259,7 @@ class V4l2:
 
     def request(self, deadline: Deadline, ready: Ready | None = None) -> int:
         """Wait for the other cameras of a rig, if any: the camera runs freely."""
-        if ready is not None:
-            ready()
-        return time.monotonic_ns()
+        return time.monotonic_ns() if ready is None else ready()[0]
 
     def take(self, deadline: Deadline) -> RawFrame | None:
         """Return the next complete frame that is newer than the last."""
