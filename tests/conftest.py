@@ -6,29 +6,20 @@ import gc
 import os
 import uuid
 from collections.abc import Callable, Iterator
-from itertools import islice
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
 import pytest
 import scipy.linalg  # noqa: F401  # loads a library of its own beside that of NumPy
 import sqlalchemy as sa
 from hypothesis import settings
-from matplotlib.figure import Figure
 
 from reseau.archive import Archive
-from reseau.core import figures
-from reseau.core.data import Frame
-from reseau.core.failure import Failure
-from reseau.core.figures import to_bytes
 from reseau.core.memory import keep_loaded
 from reseau.core.threads import always_one_thread
-from reseau.io import TestfieldDesign
-from reseau.measure.points import Measured
-from reseau.measure.testfield.measure import TestfieldOptions, measure_testfield
-from reseau.procedures import next_pose, target_measurement
 
 from . import kept
+from .lighter import few_poses, few_results
 
 # A loaded machine, or code that is compiled at its first call, is not an error.
 settings.register_profile("untimed", deadline=None)
@@ -36,6 +27,8 @@ settings.load_profile("untimed")
 
 _AROUND = {"cameras", "capture", "cli", "exchange", "http", "service", "sessions", "tests"}
 """Folders of tests of what is done with calibrations."""
+_BEFORE = {"procedures", "report"}
+"""Folders of tests of what comes before, which is measured and drawn."""
 collect_ignore = ["capture/loaded.py"]
 _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -101,29 +94,12 @@ def assets(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def few_poses(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Compare few photographs that could be proposed, and measure each once, where what follows is tested."""
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        around = request.path.parent.name in _AROUND
-        if around:
-            monkeypatch.setattr(target_measurement, "measure_testfield", _measured_once)
-            monkeypatch.setattr(figures, "to_bytes", _blank)
-        if around or request.path.parent.name in ("procedures", "report"):
-            every = next_pose._candidates
-            monkeypatch.setattr(next_pose, "_candidates", lambda: islice(every(), 0, None, 9))
-            monkeypatch.setattr(next_pose, "_STEPS", ())
+def _lighter(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Where what follows is tested, long parts are shorter."""
+    around = request.path.parent.name
+    shorter = few_results if around in _AROUND else few_poses if around in _BEFORE else nullcontext
+    with shorter():
         yield
-
-
-def _measured_once(
-    frame: Frame, design: TestfieldDesign, options: TestfieldOptions | None = None
-) -> Measured | Failure:
-    return kept.once(measure_testfield, frame, design, options)
-
-
-def _blank(figure: Figure, kind: str, **options: Any) -> bytes:
-    """Figures of pages are made, but not drawn: what they show is tested with the reports."""
-    return b"<svg viewBox='0 0 1 1'></svg>" if kind == "svg" else to_bytes(figure, kind, **options)
 
 
 @pytest.fixture(autouse=True, scope="session")

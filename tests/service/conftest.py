@@ -14,6 +14,8 @@ import pytest
 
 from reseau.core.exclusive import lock_file
 
+from ..lighter import few_results
+
 
 @pytest.fixture(scope="session", autouse=True)
 def _cheap_passwords() -> Iterator[None]:
@@ -30,7 +32,8 @@ def archived(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     own = tmp_path_factory.mktemp("archived")
     if "PYTEST_XDIST_WORKER" not in os.environ:
-        populate(own)
+        with few_results():
+            populate(own)
         return own
     made = tmp_path_factory.getbasetemp().parent / "archived"
     with made.with_suffix(".lock").open("ab") as lock:
@@ -39,7 +42,8 @@ def archived(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if not made.exists():
             unfinished = made.with_suffix(f".{os.getpid()}")
             unfinished.mkdir()
-            populate(unfinished)
+            with few_results():
+                populate(unfinished)
             unfinished.rename(made)
     shutil.copytree(made, own, dirs_exist_ok=True)
     return own
