@@ -202,6 +202,8 @@ def test_what_no_camera_describes_is_refused(
         ("</document>", "", "is not well-formed XML .*export it again"),
         ("<f>1500.0</f>", "<f>abc</f>", "calibration 1, f: `abc` is not a number"),
         ("<f>1500.0</f>", "", "has no focal length in pixels"),
+        ('width="1600"', 'width="1600.5"', "width: is 1600.5, not a number of pixels"),
+        ('height="1200"', 'height="-3"', "height: is -3, not a number of pixels"),
         ('sensor_id="0"', 'sensor_id="9"', "camera im0 has no sensor"),
         ('<marker marker_id="3">', '<marker marker_id="99">', "is not in the list of markers"),
         ('sxy="0.02"', 'sxy="-1"', "has an accuracy that is not positive"),

@@ -87,6 +87,13 @@ class Node:
             return default
         return float(_finite([self.attribute(name)], 1, f"{self.where}, {name}")[0])
 
+    def pixels(self, name: str) -> int:
+        """Return the number of pixels in an attribute."""
+        found = self.number(name)
+        if not (found >= 1 and found.is_integer()):
+            raise FormatError(f"is {found:g}, not a number of pixels", where=f"{self.where}, {name}")
+        return int(found)
+
     def numbers(self, count: int | None = None) -> Array:
         """Return the finite numbers of its text, separated by white space or commas.
 

@@ -367,7 +367,7 @@ def _camera(sensor: Node, corner: bool) -> Camera:
     given = kinds.get("adjusted") or next(iter(kinds.values()), None)
     properties, name = _properties(sensor), sensor.get("label") or sensor.attribute("id")
     size = sensor.need("resolution")
-    width, height = int(size.number("width")), int(size.number("height"))
+    width, height = size.pixels("width"), size.pixels("height")
     where, values = sensor.where, dict[str, float]()
     kind = sensor.get("type", "frame")
     if given is not None:
