@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import zlib
 from collections.abc import Iterator
@@ -230,7 +231,8 @@ def _sqlite(path: Path, read_only: bool) -> Engine:
     engine = sa.create_engine(f"sqlite:///file:{path}?{options}", connect_args={"timeout": _WAIT_S})
 
     @sa.event.listens_for(engine, "connect")
-    def _prepare(raw: sqlite3.Connection, _: object) -> None:
+    def _prepare(raw: sqlite3.Connection, record: sa.pool.ConnectionPoolEntry) -> None:
+        record.info[_HELD] = path.exists() and not os.access(path, os.W_OK)
         raw.isolation_level = None  # SQLAlchemy begins transactions, also around CREATE TABLE
         if not read_only:
             raw.execute("PRAGMA journal_mode=WAL")
@@ -239,6 +241,12 @@ def _sqlite(path: Path, read_only: bool) -> Engine:
         # up to that for each. The system has these pages, too.
         raw.execute(f"PRAGMA cache_size=-{_CACHE_KB}")
         raw.execute("PRAGMA foreign_keys=ON")
+
+    @sa.event.listens_for(engine, "checkout")
+    def _renew(_: object, record: sa.pool.ConnectionPoolEntry, __: object) -> None:
+        # SQLite never writes by a connection that it opened while the disk was read-only.
+        if record.info[_HELD] and os.access(path, os.W_OK):
+            raise sa.exc.DisconnectionError
 
     @sa.event.listens_for(engine, "begin")
     def _begin(connection: sa.Connection) -> None:
@@ -251,6 +259,7 @@ def _sqlite(path: Path, read_only: bool) -> Engine:
 
 
 _READING = "reseau_reading"
+_HELD = "reseau_read_only"
 _WAIT_S = 30
 """How long a transaction waits for the others that write, and how long one may do nothing."""
 _CACHE_KB = 256
