@@ -655,7 +655,10 @@ class LeftOut:
         }
         lenses = [by_name[camera.id] for camera in self.network.cameras]
         found = misnamed(self.network, lenses, self.found)
-        return None if found is None else replace(self, found=found)
+        if found is None:
+            return None
+        # A camera by which more points lie nowhere, such as one with a pole, tells less than no camera.
+        return self if found.nowhere > self.found.nowhere else replace(self, found=found)
 
 
 def left_out(

@@ -75,6 +75,11 @@ class Misnamed:
         """Whether names or places are wrong."""
         return "names" if self.log_odds > 0 else "blunders"
 
+    @property
+    def nowhere(self) -> int:
+        """Number of image points that lie in no place of a point."""
+        return int((self.point < 0).sum())
+
 
 @dataclass(frozen=True, eq=False)
 class _Image:
