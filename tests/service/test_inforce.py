@@ -372,9 +372,9 @@ def test_a_creeping_drift_is_announced_and_held_back_and_counts_from_the_referen
 def test_a_season_is_told_beside_a_trend_until_it_has_turned(archive: Archive) -> None:
     known, _ = started(archive)
     rng, said = np.random.default_rng(5), list[str]()
-    for k in range(1, 27):  # a yearly swing of 0.25 px, of which 0.4 px are allowed
+    for k in range(1, 27):  # a yearly swing of 0.3 px, of which 0.4 px are allowed
         values = {key: FIRST[key] + 4 * SIGMA[key] * rng.normal() for key in SIGMA}
-        values["c"] += 0.005 * np.sin(2 * np.pi * 7 * k / 365.25)
+        values["c"] += 0.006 * np.sin(2 * np.pi * 7 * k / 365.25)
         made = known.decide("left", camera(scale=4.0, **values), RULES, since=day(7 * k))
         assert made.outcome in ("accepted", "accepted with warning")
         said.append("; ".join(f.text for f in made.judgement.findings if f.rule == "trend"))
