@@ -7,6 +7,7 @@ error of the tree that names the instrument; not long after its deadline; and th
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,7 +20,7 @@ from reseau_sims.serving import KINDS, Fault, FaultScript, Kind
 
 from .rigs import LATE_S, RIGS, Rig, aravis_is_missing, left_open, rig
 
-AT_A_TIME = 8
+AT_A_TIME = 4
 CELLS = [
     pytest.param(driver, transport, kind, at, marks=() if at in (0, 2) else pytest.mark.slow)
     for driver, transport in RIGS
@@ -51,9 +52,11 @@ def together(request: pytest.FixtureRequest, _libraries_are_loaded: None) -> Tog
     done = dict[tuple[Any, ...], tuple[dict[tuple[str, str], Future[Any]], bool]]()
 
     def all_of(job: Callable[..., Any], *args: Any) -> tuple[dict[tuple[str, str], Future[Any]], bool]:
-        before = left_open()
+        before, interval = left_open(), sys.getswitchinterval()
+        sys.setswitchinterval(interval / 10)  # an answer waits for the threads of all others
         with ThreadPoolExecutor(AT_A_TIME) as pool:
             found = {key: pool.submit(job, *key, *args) for key in wanted}
+        sys.setswitchinterval(interval)
         deadline = time.monotonic() + 5.0
         while left_open() != before and time.monotonic() < deadline:
             time.sleep(0.01)
