@@ -7,11 +7,8 @@ error of the tree that names the instrument; not long after its deadline; and th
 from __future__ import annotations
 
 import os
-import sys
 import time
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -20,7 +17,6 @@ from reseau_sims.serving import KINDS, Fault, FaultScript, Kind
 
 from .rigs import LATE_S, RIGS, Rig, aravis_is_missing, left_open, rig
 
-AT_A_TIME = 4
 CELLS = [
     pytest.param(driver, transport, kind, at, marks=() if at in (0, 2) else pytest.mark.slow)
     for driver, transport in RIGS
@@ -39,55 +35,24 @@ def _libraries_are_loaded() -> None:
             pass
 
 
-Together = Callable[..., Any]
-"""What a job gives for a rig; its other arguments follow."""
-
-
-@pytest.fixture(scope="session")
-def together(request: pytest.FixtureRequest, _libraries_are_loaded: None) -> Together:
-    """Does a job for all rigs of the tests that are run, several at a time: most of it is waiting."""
-    chosen = [getattr(item, "callspec", None) for item in request.session.items]
-    given = [each.params for each in chosen if each is not None]
-    wanted = {key for key in RIGS if any((p.get("driver"), p.get("transport")) == key for p in given)}
-    done = dict[tuple[Any, ...], tuple[dict[tuple[str, str], Future[Any]], bool]]()
-
-    def all_of(job: Callable[..., Any], *args: Any) -> tuple[dict[tuple[str, str], Future[Any]], bool]:
-        before, interval = left_open(), sys.getswitchinterval()
-        sys.setswitchinterval(interval / 10)  # an answer waits for the threads of all others
-        with ThreadPoolExecutor(AT_A_TIME) as pool:
-            found = {key: pool.submit(job, *key, *args) for key in wanted}
-        sys.setswitchinterval(interval)
-        deadline = time.monotonic() + 5.0
-        while left_open() != before and time.monotonic() < deadline:
-            time.sleep(0.01)
-        return found, left_open() == before
-
-    def one(job: Callable[..., Any], driver: str, transport: str, *args: Any) -> Any:
-        key = job, *args
-        if key not in done:
-            done[key] = all_of(job, *args)
-        found, closed = done[key]
-        assert closed
-        return found[driver, transport].result()
-
-    return one
+@pytest.fixture(autouse=True)
+def _nothing_is_left_open(_libraries_are_loaded: None, request: pytest.FixtureRequest) -> Iterator[None]:
+    before = left_open()
+    yield
+    deadline = time.monotonic() + 5.0
+    while left_open() != before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    request.node.user_properties.append(("nothing left open", left_open() == before))
+    assert left_open() == before
 
 
 @pytest.mark.parametrize(("driver", "transport", "kind", "at"), CELLS)
 def test_a_fault_gives_the_right_result_or_an_error_in_time(
-    driver: str, transport: str, kind: Kind, at: int, together: Together,
-    record_property: Callable[[str, object], None],
-) -> None:  # fmt: skip
+    driver: str, transport: str, kind: Kind, at: int, record_property: Callable[[str, object], None]
+) -> None:
+    script = FaultScript()
     for key, value in {"driver": driver, "transport": transport, "fault": kind}.items():
         record_property(key, value)
-    outcome = together(_faulted, driver, transport, kind, at)
-    for key, value in (outcome | {"nothing left open": True}).items():
-        record_property(key, value)
-
-
-def _faulted(driver: str, transport: str, kind: Kind, at: int) -> dict[str, object]:
-    """What comes of a fault."""
-    script = FaultScript()
     with rig(driver, transport, script) as found:
         found.work(0)
         script.fault_at(script.count + at, Fault(kind, LATE_S if kind == "late" else 0.2))
@@ -98,6 +63,8 @@ def _faulted(driver: str, transport: str, kind: Kind, at: int) -> dict[str, obje
         except InstrumentError as error:
             message = error
         took = time.monotonic() - began
+        record_property("outcome", "right" if message is None else type(message).__name__)
+        record_property("seconds", took)
         names = {found.device.name, *getattr(found.device, "cameras", ())}
         assert message is None or (message.instrument in names and message.command)
         assert took < 10.0
@@ -107,7 +74,6 @@ def _faulted(driver: str, transport: str, kind: Kind, at: int) -> dict[str, obje
         # A state the instrument was put into makes it reject commands; a line fault never does.
         if kind not in ("wrong state", "out of range", "stuck", "power-cycled"):
             assert found.machine.violations == []
-    return {"outcome": "right" if message is None else type(message).__name__, "seconds": took}
 
 
 @pytest.mark.parametrize(
@@ -139,8 +105,8 @@ def test_a_usb_instrument_is_found_again_after_its_cable_was_pulled() -> None:
 
 
 @pytest.mark.parametrize(("driver", "transport"), list(RIGS))
-def test_random_faults_never_give_a_wrong_answer(driver: str, transport: str, together: Together) -> None:
-    together(_endure, driver, transport, 120, 0.03)
+def test_random_faults_never_give_a_wrong_answer(driver: str, transport: str) -> None:
+    _endure(driver, transport, exchanges=120, rate=0.03)
 
 
 @pytest.mark.slow
