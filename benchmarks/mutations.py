@@ -1,4 +1,4 @@
-"""Whether the quick tests notice errors in the core of each package.
+"""Whether the quick tests and the examples notice errors in the core of each package.
 
     python benchmarks/mutations.py [NUMBER …] [--out build/mutations.json] [--again] [--table]
 
@@ -75,7 +75,7 @@ def noticed(mutation: Mutation, copy: Path) -> str:
     tests = [f"src/reseau/{mutation.file}", *mutation.tests]
     # A file of the package is searched for its examples alone.
     settings = {"cache_dir": ROOT / ".pytest_cache", "python_functions": "test_*", "python_classes": "none"}
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0"]
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "--doctest-modules"]
     command += [word for key, value in settings.items() for word in ("-o", f"{key}={value}")]
     path.write_text(source.replace(mutation.was, mutation.becomes), "utf-8")
     try:
