@@ -385,28 +385,6 @@ def test_a_killed_worker_is_shown_restarted_and_leaves_nothing_moving(one: Serve
 
 
 @pytest.mark.slow
-def test_a_service_that_ends_leaves_the_session_running_and_finds_it_again(rig: Rig, one: Served) -> None:
-    client = one.client("operate")
-    client.post(f"{BENCH}/move", json={"axis": "tilt", "position": 0.0})
-    assert begin(client, "alone").status_code == 201
-    pid = one.service.benches["cellar"].status["pid"]
-    until(lambda: client.get(BENCH).json()["session"]["good"] >= 1)
-    link = one.service.benches["cellar"]
-    # The connection breaks as when the service is killed.
-    link._over.set()
-    link._wire.close()  # type: ignore[union-attr]
-    link._thread.join(5)
-    with rig.serve() as second:
-        other = second.client()
-        found = state(other, "running", "ready")
-        assert second.service.benches["cellar"].restarts == -1
-        assert second.service.benches["cellar"].status["pid"] == pid
-        assert found["session"]["name"] == "alone"
-        state(other, "ready")
-        assert other.get("/api/1/sessions/alone").json()["status"] == "done"
-
-
-@pytest.mark.slow
 def test_a_bench_on_another_machine_is_reached_with_its_own_certificate_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -551,6 +529,28 @@ def test_positions_are_reported_while_an_axis_moves_and_who_moves_it(one: Served
     mover.join(60)
     assert len([each for each in seen if 0.0 < each < 100.0]) >= 2
     client.post(f"{BENCH}/move", json={"axis": "roll", "position": 0.0})
+
+
+@pytest.mark.slow  # the last that asks `one`, whose connection it ends
+def test_a_service_that_ends_leaves_the_session_running_and_finds_it_again(rig: Rig, one: Served) -> None:
+    client = one.client("operate")
+    client.post(f"{BENCH}/move", json={"axis": "tilt", "position": 0.0})
+    assert begin(client, "alone").status_code == 201
+    pid = one.service.benches["cellar"].status["pid"]
+    until(lambda: client.get(BENCH).json()["session"]["good"] >= 1)
+    link = one.service.benches["cellar"]
+    # The connection breaks as when the service is killed.
+    link._over.set()
+    link._wire.close()  # type: ignore[union-attr]
+    link._thread.join(5)
+    with rig.serve() as second:
+        other = second.client()
+        found = state(other, "running", "ready")
+        assert second.service.benches["cellar"].restarts == -1
+        assert second.service.benches["cellar"].status["pid"] == pid
+        assert found["session"]["name"] == "alone"
+        state(other, "ready")
+        assert other.get("/api/1/sessions/alone").json()["status"] == "done"
 
 
 @pytest.mark.slow
