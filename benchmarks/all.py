@@ -119,6 +119,7 @@ ENTRIES = (
     Entry("pins", "Wires in B-mode frames, beside PLUS", "pins.py", (), "ultrasound_nwire"),
     Entry("edges", "Slanted edges, beside ISO 12233", "edge.py --edges 10"),
     Entry("blurred", "Blurred targets, drawn with batoid's rays", "blurred.py --count 2", ("batoid",)),
+    Entry("moving", "Blurred targets that moved during the exposure", "moving.py --count 7", ("batoid",)),
     Entry("rays", "Ray tracing", "raytrace.py", ("batoid", "optiland")),
     Entry("refraction", "Refraction", "multimedia.py --part cavity", (), "multimedia_cavity"),
     Entry("water", "Cameras above water", "water_rigs.py --scenario minimal --seeds 6 --jobs 2",
@@ -135,7 +136,7 @@ SUBJECTS = {
         "model-choice", "next-photograph", "stereo", "refraction", "water", "nist")),
     "peers-targets": ("Targets and boards, beside peers", (
         "disks", "testfield", "boards", "other-boards", "drawn-boards", "reseau-simulated", "reseau",
-        "edges", "blurred", "rays")),
+        "edges", "blurred", "moving", "rays")),
     "peers-pictures": ("Film, screens and frames of instruments, beside peers", (
         "vidicon", "hough", "film", "fiducials", "fiducials-learnt", "oscilloscope-simulated",
         "oscilloscope", "pins")),

@@ -14,7 +14,8 @@ from reseau.core.failure import Code, Failure
 from reseau.measure.blurred import BlurredOptions, estimate_optics, measure_blurred
 from reseau.measure.blurred.estimate import EstimatedOptics
 from reseau.measure.blurred.likeness import Residuals
-from reseau.measure.blurred.measure import Moving, Varied
+from reseau.measure.blurred.measure import Varied
+from reseau.measure.blurred.motion import Motion, Moving, measure_explained
 from reseau.measure.blurred.shapes import RayShapes
 from reseau.measure.matching.shapes import Window
 from reseau.optics.formation import Outline, PixelResponse
@@ -132,17 +133,24 @@ def test_parameters_without_a_standard_deviation_are_refused(
 
 
 @pytest.mark.slow
-def test_motion_is_another_cause_of_blur() -> None:
-    still = drawn()
-    steps = np.arange(-3, 4)
-    moved = np.mean([np.roll(still, step, axis=1) for step in steps], axis=0)
+@pytest.mark.parametrize(("steps", "said"), [(np.arange(-3, 4), "moved over 6.9 px"), (np.zeros(1), "")])
+def test_motion_explains_what_a_lens_at_rest_does_not(steps: Array, said: str) -> None:
+    moved = np.mean([np.roll(drawn(), int(step), axis=1) for step in steps], axis=0)
     frame = Frame(moved + np.random.default_rng(1).normal(0, 1.0, moved.shape), 255.0)
-    path = np.stack([steps, 0 * steps], axis=1).astype(float)
-    found = measure_blurred(frame, Moving(camera(), path), ["1"], [target()])
-    error = found.xy[0] - blurs.principal_pixel(CENTRE)
-    assert np.abs(error).max() < 0.02
-    without = measure_blurred(frame, camera(), ["1"], [target()], BlurredOptions(psf_log_sigma=1.0))
-    assert not without.ok.any() or without.noise[0] > 1.2 * found.noise[0]
+    found, view = measure_explained(frame, camera(), ["1"], [target()], BlurredOptions())
+    assert [said in note.text for note in found.notes] == [True] * bool(said)
+    assert isinstance(view, Moving) == bool(said)
+    assert np.abs(found.xy[0] - blurs.principal_pixel(CENTRE)).max() < 0.02
+
+
+def test_lines_that_are_exposed_later_see_the_target_where_it_is_then() -> None:
+    still, point = camera(), CENTRE[None]
+    motion = Motion(np.array([0.0, 1e-3, 0.0, 0.0, 0.0, 0.0]), np.zeros(6), per_line=0.01)
+    line = still.corresponding(point)[0, 1]
+    late = Moving(still, replace(motion, middle=line - 50), 5).corresponding(point)
+    assert late == pytest.approx(still.corresponding(motion.moved(point, np.array([[0.5]]))[0]), abs=1e-9)
+    at_middle = Moving(still, replace(motion, middle=line), 5).corresponding(point)
+    assert at_middle == pytest.approx(still.corresponding(point), abs=1e-9)
 
 
 def test_a_thin_lens_in_place_of_the_true_one_misses_the_place_and_its_sigma_says_so() -> None:

@@ -67,6 +67,15 @@ def blurred(
             most=10,
         ),
     ] = None,
+    exposure_lines: Annotated[
+        float | None,
+        Option(
+            "Lines of a rolling shutter that are read during an exposure: exposure over the time of a line. "
+            "Default: all lines are exposed at once.",
+            Group.CAMERA,
+            least=1,
+        ),
+    ] = None,
     mirrored: Annotated[v.Mirrored | None, BY_DESIGN] = None,
     max_rotation_deg: Annotated[v.MaxRotationDeg | None, NOT_NOMINAL] = None,
     figure: Annotated[
@@ -76,7 +85,8 @@ def blurred(
 ) -> None:
     """Measure blurred targets: the places of their corresponding rays.
 
-    The images of the targets are formed by rays through the lens and matched with the photograph.
+    The images of the targets are formed by rays through the lens and matched with the photograph. Where they
+    are not those of the lens as it is stated, motion during the exposure and another focus are considered.
     """
     from ..core.failure import Failure
     from ..exchange import read_network
@@ -91,7 +101,9 @@ def blurred(
     turned = ReseauOptions(**orientation(mirrored, max_rotation_deg))
 
     def measured(frame: Frame) -> BlurredResult | Failure:
-        found = measure_blurred_photograph(frame, target, imaging, block, image.name, turned, focus_sigma_mm)
+        found = measure_blurred_photograph(
+            frame, target, imaging, block, image.name, turned, focus_sigma_mm, exposure_lines
+        )
         if isinstance(found, Failure):
             return found
         if figure is not None:

@@ -22,8 +22,9 @@ from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
 from ..exchange.lenses import Lens
 from ..io import ReseauDesign, TestfieldDesign
-from ..measure.blurred import BlurredOptions, estimate_optics, measure_blurred
+from ..measure.blurred import BlurredOptions, estimate_optics
 from ..measure.blurred.measure import BlurredResult, Varied
+from ..measure.blurred.motion import Moving, focus_remark, measure_explained
 from ..optics import Pose
 from ..optics.formation import mark_outline
 from ..optics.lenses import Paraxial, Prescription, RayMap, ThinLens
@@ -350,6 +351,7 @@ def measure_blurred_frame(
     *,
     sharp: Measurer | None = None,
     focus_sigma_mm: float | None = None,
+    exposure_lines: float | None = None,
 ) -> BlurredFrame | Failure:
     """Measure the blurred targets of a plane design in a frame.
 
@@ -370,6 +372,8 @@ def measure_blurred_frame(
         Measures the targets as if they were sharp; by default as :func:`measurer_of` does.
     focus_sigma_mm : float, optional
         Standard deviation of the place of the image surface of a lens: it is estimated from all targets.
+    exposure_lines : float, optional
+        Lines of a rolling shutter that are read during an exposure; by default all are exposed at once.
 
     Returns
     -------
@@ -390,12 +394,14 @@ def measure_blurred_frame(
     False
     """
     options = options or BlurredOptions(polarity=design.polarity)
+    per_line = 0.0 if exposure_lines is None else 2 / exposure_lines
+    given = focus_sigma_mm is not None
     if pose is not None:
         sharpened = _focused(frame, design, camera, pose, options, focus_sigma_mm)
         if isinstance(sharpened, Failure):
             return sharpened
-        found = _measured(frame, design, sharpened[0], pose, options, np.nan)
-        return _some(_described(_noted(found, _moved_by(*sharpened[1:]))))
+        found = _measured(frame, design, sharpened[0], pose, options, np.nan, given, per_line)
+        return _some(_described(_noted(found, [focus_remark(*sharpened[1:])] if given else [])))
     first = (sharp or measurer_of(design))(frame)
     if isinstance(first, Failure):
         return replace(first, reason=f"no approximate positions: {first.reason}")
@@ -409,7 +415,7 @@ def measure_blurred_frame(
             return sharpened
         view, by, sigma = sharpened
         moved += by
-        found = _measured(frame, design, view, oriented[0], options, oriented[1])
+        found = _measured(frame, design, view, oriented[0], options, oriented[1], given, per_line)
         if found.measured.found < _FEWEST:
             return Failure(
                 f"{found.measured.found} of {len(design.ids)} targets are like their images by rays: "
@@ -419,10 +425,10 @@ def measure_blurred_frame(
         change = np.abs(found.measured.predicted - before)
         if k + 1 == _ROUNDS or np.nanmax(change) < _SETTLED_PX:
             break
-        points, before, camera = found.measured.points, found.measured.predicted, view
+        points, before, camera = found.measured.points, found.measured.predicted, found.camera
     # What is said of deviations concerns the targets measured as if they were sharp.
     notes = [remark for remark in first.remarks if remark.code != Code.INCONSISTENT]
-    return _some(_described(_noted(found, (*notes, *_moved_by(moved, sigma)))))
+    return _some(_described(_noted(found, [*notes, focus_remark(moved, sigma)] if given else notes)))
 
 
 def refocused(camera: RayMap, by_mm: float) -> RayMap:
@@ -448,7 +454,7 @@ def refocused(camera: RayMap, by_mm: float) -> RayMap:
     >>> float(moved.lens.surfaces[-1].vertex[2])
     102.5
     """
-    if isinstance(camera, CalibratedLens):
+    if isinstance(camera, CalibratedLens | Moving):
         return replace(camera, camera=refocused(camera.camera, by_mm))
     if not isinstance(camera, LensCamera):
         raise UsageError("has no image surface to be moved", where=type(camera).__name__)
@@ -472,14 +478,6 @@ def _focused(
     if isinstance(found, Failure):
         return found
     return found.camera, float(found.values[0]), float(found.sigma[0])
-
-
-def _moved_by(by_mm: float, sigma_mm: float) -> tuple[Remark, ...]:
-    """A remark on the estimated focus, if it was."""
-    if sigma_mm == 0:
-        return ()
-    text = f"the focus was estimated: {by_mm:.4f} ± {sigma_mm:.4f} mm behind the stated image surface"
-    return (Remark(text, Code.BLURRED),)
 
 
 def _noted(found: BlurredFrame, remarks: Sequence[Remark]) -> BlurredFrame:
@@ -624,8 +622,19 @@ def _row_in(network: Network, image: str) -> int:
 
 
 def _measured(
-    frame: Frame, design: Design, camera: RayMap, pose: Pose, options: BlurredOptions, rms_px: float
+    frame: Frame,
+    design: Design,
+    camera: RayMap,
+    pose: Pose,
+    options: BlurredOptions,
+    rms_px: float,
+    focus_given: bool,
+    per_line: float,
 ) -> BlurredFrame:
     names, targets = targets_of(design, pose, camera)
-    measured = measure_blurred(frame, camera, names, targets, options)
-    return BlurredFrame(measured, pose, tuple(targets), rms_px, camera)
+    inner = camera.camera if isinstance(camera, CalibratedLens) else camera
+    by = refocused if isinstance(inner, LensCamera) and not focus_given else None
+    measured, view = measure_explained(
+        frame, camera, names, targets, options, refocused=by, per_line=per_line
+    )
+    return BlurredFrame(measured, pose, tuple(targets), rms_px, view)

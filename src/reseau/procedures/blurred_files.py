@@ -108,6 +108,7 @@ def measure_blurred_photograph(
     name: str = "",
     turned: ReseauOptions | None = None,
     focus_sigma_mm: float | None = None,
+    exposure_lines: float | None = None,
 ) -> BlurredFrame | Failure:
     """Measure the blurred targets of a plane design in a photograph, oriented by a network or by themselves.
 
@@ -125,7 +126,7 @@ def measure_blurred_photograph(
         Name of its image in the network, or of its file.
     turned : ReseauOptions, optional
         How a reseau may be turned or mirrored, where no network tells.
-    focus_sigma_mm : float, optional
+    focus_sigma_mm, exposure_lines : float, optional
         See :func:`~reseau.procedures.blurred.measure_blurred_frame`, also for what is returned.
 
     Raises
@@ -151,7 +152,14 @@ def measure_blurred_photograph(
             sharp = partial(measure_reseau, design=design, options=turned)
     options = imaging.options(design.polarity)
     return measure_blurred_frame(
-        frame, design, view, pose, options, sharp=sharp, focus_sigma_mm=focus_sigma_mm
+        frame,
+        design,
+        view,
+        pose,
+        options,
+        sharp=sharp,
+        focus_sigma_mm=focus_sigma_mm,
+        exposure_lines=exposure_lines,
     )
 
 

@@ -27,8 +27,9 @@ from ..core.executors import Executor, Here
 from ..core.failure import Code, Failure, Remark
 from ..io.network import Network1
 from ..io.targets import SpaceTargets
-from ..measure.blurred import BlurredOptions, measure_blurred
+from ..measure.blurred import BlurredOptions
 from ..measure.blurred.measure import BlurredResult
+from ..measure.blurred.motion import measure_explained
 from ..measure.ordinary import ordinary_coordinates
 from ..optics.lenses import RayMap, ThinLens
 from ..optics.lenses.images import PlaneTarget, image_scale
@@ -313,13 +314,27 @@ def _too_few(failure: Failure, measured: Mapping[str, BlurredResult], left_out: 
     return replace(failure, reason=text)
 
 
+def _explained(entry: BlurredRound) -> list[Remark]:
+    """What explains photographs beside their lens."""
+    return [
+        replace(note, text=f"{name}: {note.text}")
+        for name, found in entry.measured.items()
+        for note in found.notes
+        if note.code == Code.BLURRED
+    ]
+
+
 def _misfits(entry: BlurredRound) -> tuple[Remark, ...]:
     """Say in which photographs the targets are not like their images by the lens.
 
     The adjustment cannot tell: another lens shifts coordinates smoothly over the image, which distortion and
     object points take up. The matching can, as it compares the form of the images.
     """
-    unlike = {name: found.misfit for name, found in entry.measured.items() if found.notes}
+    unlike = {
+        name: found.misfit
+        for name, found in entry.measured.items()
+        if any(note.code == Code.INCONSISTENT for note in found.notes)
+    }
     if not unlike:
         return ()
     names, values = list(unlike), list(unlike.values())
@@ -354,7 +369,7 @@ class _Job(NamedTuple):
 
 
 def _measured(job: _Job) -> BlurredResult:
-    return measure_blurred(*job)
+    return measure_explained(*job)[0]
 
 
 class _Run:
@@ -585,7 +600,7 @@ class _Run:
     def notes(self, rounds: list[BlurredRound], best: int) -> tuple[Remark, ...]:
         """Return what a user should know."""
         last = rounds[best]
-        found = [*self._stand_ins(), *_misfits(last), *self._unfollowed(last.result)]
+        found = [*self._stand_ins(), *_explained(last), *_misfits(last), *self._unfollowed(last.result)]
         missing = [name for name in self.network.images if name not in self.frames]
         if missing:
             found.append(

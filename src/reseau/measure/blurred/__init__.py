@@ -7,7 +7,7 @@ corresponding ray, the principal ray of one wavelength (Meid 1992, sections 2.2 
 of all other marks: two shifts, contrast and background, the width of the remaining blur, and, if wanted,
 parameters of the optics such as focus and media.
 
-Motion during the exposure is another physical cause: :class:`Moving` smears the images of any lens.
+Motion during the exposure is another physical cause (:mod:`reseau.measure.blurred.motion`).
 """
 
 from .estimate import estimate_optics

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -34,8 +34,12 @@ class EstimatedOptics:
     cov : ndarray (p, p)
     camera : RayMap
         With these values.
-    used : int
-        Number of targets.
+    costs : mapping of int to float
+        Sum of squares of each target that was used, over the variance of the noise.
+    free : mapping of int to int
+        Degrees of freedom of these.
+    shifts : mapping of int to ndarray (p, 2)
+        Displacement of their places with each parameter.
 
     Examples
     --------
@@ -44,7 +48,7 @@ class EstimatedOptics:
     >>> from reseau.optics.lenses import ThinLens
     >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> lens = ThinLens(50.0, 12.5, 52.1, SensorPlane((0.01, 0.01), (40.0, 40.0)))
-    >>> EstimatedOptics(("focus_mm",), np.array([0.1]), np.array([[4e-4]]), lens, 24).sigma
+    >>> EstimatedOptics(("focus_mm",), np.array([0.1]), np.array([[4e-4]]), lens).sigma
     array([0.02])
     """
 
@@ -52,7 +56,14 @@ class EstimatedOptics:
     values: Array
     cov: Array
     camera: RayMap = field(repr=False)
-    used: int
+    costs: Mapping[int, float] = field(default_factory=dict, repr=False)
+    free: Mapping[int, int] = field(default_factory=dict, repr=False)
+    shifts: Mapping[int, Array] = field(default_factory=dict, repr=False)
+
+    @property
+    def used(self) -> int:
+        """Number of targets."""
+        return len(self.costs)
 
     @property
     def sigma(self) -> Array:
@@ -65,6 +76,8 @@ def estimate_optics(
     targets: Sequence[PlaneTarget],
     varied: Varied,
     options: BlurredOptions | None = None,
+    start: Array | None = None,
+    halves: dict[int, int] | None = None,
 ) -> EstimatedOptics | Failure:
     """Estimate parameters of the optics that all targets of a frame have in common.
 
@@ -81,6 +94,10 @@ def estimate_optics(
     varied : Varied
         The parameters with their prior standard deviations.
     options : BlurredOptions, optional
+    start : ndarray (p,), optional
+        Values from which corrections begin; by default zeros.
+    halves : dict of int to int, optional
+        Half sides of the windows of targets; those that are missing are added.
 
     Returns
     -------
@@ -104,9 +121,10 @@ def estimate_optics(
     array([0.1])
     """
     # The same rays and pixels throughout, so that sums of squares can be compared.
-    chosen, halves = options or BlurredOptions(), dict[int, int]()
+    chosen, halves = options or BlurredOptions(), {} if halves is None else halves
     chosen = replace(chosen, varied=None, rings=chosen.rings or RINGS[0])
-    prior, values = np.diag(1 / np.square(varied.sigma)), np.zeros(len(varied.names))
+    prior = np.diag(1 / np.square(varied.sigma))
+    values = np.zeros(len(varied.names)) if start is None else start
     equations = partial(_Common.of, frame, tuple(targets), varied, chosen, halves)
     at = equations(values)
     damping = _DAMPING
@@ -117,8 +135,11 @@ def estimate_optics(
         cost = sum(at.costs.values())
         newton = np.linalg.solve(normal, right)
         if newton @ right < _UNCHANGED * cost:
-            cov: Array = np.asarray(np.linalg.inv(normal) * max(cost / at.freedom, 1.0), dtype=np.float64)
-            return EstimatedOptics(varied.names, values, cov, varied.camera(values), len(at.costs))
+            cov: Array = np.asarray(
+                np.linalg.inv(normal) * max(cost / sum(at.free.values()), 1.0), dtype=np.float64
+            )
+            fit = at.costs, at.free, at.shifts
+            return EstimatedOptics(varied.names, values, cov, varied.camera(values), *fit)
         step = np.linalg.solve(normal + damping * np.diag(np.diagonal(normal)), right)
         try:
             trial = equations(values + step)
@@ -141,7 +162,8 @@ class _Common:
     normal: Array
     right: Array
     costs: dict[int, float]
-    freedom: int
+    free: dict[int, int]
+    shifts: dict[int, Array]
 
     @classmethod
     def of(
@@ -156,11 +178,12 @@ class _Common:
         around = replace(varied, camera=partial(_moved, varied.camera, values))
         names = tuple(str(k) for k in range(len(targets)))
         run = Run(frame, varied.camera(values), names, targets, options)
-        normal, right, costs, freedom = np.zeros((len(values),) * 2), np.zeros(len(values)), {}, 0
-        for row, part, to_the_right, cost, count in run.equations(run.result(), around, halves):
-            normal, right, freedom = normal + part, right + to_the_right, freedom + count
-            costs[row] = cost
-        return cls(normal, right, costs, freedom)
+        parts = list(run.equations(run.result(), around, halves))
+        normal, right = np.zeros((len(values),) * 2), np.zeros(len(values))
+        for part in parts:
+            normal, right = normal + part.normal, right + part.right
+        names = "cost", "freedom", "shifts"
+        return cls(normal, right, *({part.row: getattr(part, name) for part in parts} for name in names))
 
     def better(self, before: _Common, prior: Array, old: Array, new: Array) -> bool:
         """Whether more targets are like their images, or the same ones more alike."""

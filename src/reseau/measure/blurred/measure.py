@@ -17,8 +17,8 @@ from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ...optics.formation import Outline, PixelResponse
-from ...optics.lenses import PupilElements, RayMap, ray_image
-from ...optics.lenses.images import PlaneTarget, RayImage, ray_images
+from ...optics.lenses import PupilElements, RayMap
+from ...optics.lenses.images import PlaneTarget, RayImage, ray_images, required_image
 from ..matching import Matches, match, with_alike_errors
 from ..matching.patches import MatchOptions
 from ..mosaic import balanced
@@ -164,43 +164,19 @@ class BlurredResult(Measured):
 
 
 @dataclass(frozen=True, eq=False)
-class Moving:
-    """A map of rays during whose exposure the image moves.
+class Equations:
+    """What a target tells of parameters of the optics, without what its place, light and width explain.
 
-    Parameters
-    ----------
-    camera : RayMap
-    path_px : ndarray (m, 2)
-        Places of the image during equal parts of the exposure, relative to its place for the result.
-
-    Examples
-    --------
-    >>> from reseau.optics.lenses import ThinLens
-    >>> from reseau.optics.lenses.ray_maps import SensorPlane
-    >>> still = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (0.0, 0.0)))
-    >>> moving = Moving(still, np.array([[-2.0, 0.0], [0.0, 0.0], [2.0, 0.0]]))
-    >>> moving.spots(np.array([[0.0, 0.0, 1000.0]]), PupilElements.gauss(2))[0].shape
-    (3, 1, 20, 2)
+    Normal equations (p, p) and (p,), sum of squares over the variance of the noise, degrees of freedom, and
+    the displacement (p, 2) of its place with each parameter.
     """
 
-    camera: RayMap
-    path_px: Array
-
-    @property
-    def unknown(self) -> float:
-        """See :class:`reseau.optics.lenses.RayMap`."""
-        return self.camera.unknown
-
-    def corresponding(self, points: Array) -> Array:
-        """See :class:`reseau.optics.lenses.RayMap`."""
-        return self.camera.corresponding(points)
-
-    def spots(self, points: Array, elements: PupilElements) -> tuple[Array, Array]:
-        """See :class:`reseau.optics.lenses.RayMap`."""
-        xy, light = self.camera.spots(points, elements)
-        return np.concatenate([xy + step for step in self.path_px]), np.concatenate(
-            [light] * len(self.path_px)
-        )
+    row: int
+    normal: Array
+    right: Array
+    cost: float
+    freedom: int
+    shifts: Array
 
 
 def measure_blurred(
@@ -242,7 +218,7 @@ def measure_blurred(
     A disk seen by a lens that is focused behind it; the image is drawn with the same rays:
 
     >>> from reseau.optics.formation import coverage
-    >>> from reseau.optics.lenses import ThinLens
+    >>> from reseau.optics.lenses import ThinLens, ray_image
     >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> camera = ThinLens(50.0, 12.5, 52.9, SensorPlane((0.01, 0.01), (40.0, 40.0)))
     >>> disk = PlaneTarget(np.array([0.0, 0, 1000]), np.eye(3)[:, :2], Outline.circle(2.0, 0.05))
@@ -301,7 +277,7 @@ class Run:
         for k in seen:
             start[k] = self._found(int(k), cast(RayImage, images[k]))
         rows = seen[np.isfinite(start[seen]).all(axis=1)]
-        halves = np.array([self._half(cast(RayImage, images[k])) for k in rows], dtype=np.intp)
+        halves = np.array([self.half(cast(RayImage, images[k])) for k in rows], dtype=np.intp)
         results: list[tuple[Rows, Array, Matches]] = []
         for half in np.unique(halves):
             those = rows[halves == half]
@@ -330,15 +306,13 @@ class Run:
             **cast(Any, self.columns),
         )
 
-    def equations(
-        self, found: BlurredResult, varied: Varied, halves: dict[int, int]
-    ) -> Iterator[tuple[int, Array, Array, float, int]]:
-        """Number, normal equations (p, p) and (p,) for varied parameters, cost, freedom of each target."""
+    def equations(self, found: BlurredResult, varied: Varied, halves: dict[int, int]) -> Iterator[Equations]:
+        """What each measured target tells of varied parameters."""
         count, o, noise = len(varied.names), self.options, self.screened.noise
         rows = np.flatnonzero(found.ok)
         shape = self._shape(rows, [cast(RayImage, self.images[k]) for k in rows], self.elements, varied)
         for k, row in enumerate(rows):
-            half = halves.setdefault(int(row), self._half(shape.images[k]))
+            half = halves.setdefault(int(row), self.half(shape.images[k]))
             xy, width = found.xy[row], float(found.psf_px[row])
             columns, lines = (np.rint(at) + np.arange(-half, half + 1.0) for at in xy)
             columns = columns[(columns >= 0) & (columns < self.frame.width)]
@@ -359,11 +333,14 @@ class Run:
             normal, right = design.T @ design, design.T @ (residuals / noise)
             normal[6, 6] += 1 / o.psf_log_sigma**2
             right[6] -= np.log(width / o.psf_px) / o.psf_log_sigma**2
-            local, common = slice(0, -count), slice(-count, None)
+            local, common = slice(0, 7), slice(7, None)
             factor = np.linalg.solve(normal[local, local], normal[local, common]).T
             cost = float((residuals**2).sum()) / noise**2
             reduced = normal[common, common] - factor @ normal[local, common]
-            yield int(row), reduced, right[common] - factor @ right[local], cost, int(valid.sum()) - 7
+            to_the_right, free = right[common] - factor @ right[local], int(valid.sum()) - 7
+            yield Equations(
+                int(row), reduced, to_the_right, cost, free, np.asarray(-factor[:, 4:6], np.float64)
+            )
 
     def _imaged(self, rows: Sequence[int], elements: PupilElements) -> list[RayImage | None]:
         """Images of targets by rays; None, with the reason, where there is none in the frame."""
@@ -398,7 +375,7 @@ class Run:
             self.why[seen[a]] = Reason(f"its image touches that of {self.ids[seen[b]]}", Code.OVERLAPPING)
         return seen[[a not in touching for a in range(len(seen))]]
 
-    def _half(self, image: RayImage) -> int:
+    def half(self, image: RayImage) -> int:
         """Half side of the window of a target."""
         need = float(np.abs(image.outline.xy).max()) + 4 * self.options.psf_px + 3
         at = int(np.searchsorted(_WINDOWS, need))
@@ -411,9 +388,9 @@ class Run:
         bright = self.options.polarity == "bright"
         return image.formed(xy, self.options.psf_px, across[:, 0], across[:, 1], response, bright=bright)
 
-    def _found(self, k: int, image: RayImage) -> Array:
-        """Approximate position of a target by correlation within the range of search; NaN if not found."""
-        half, reach = self._half(image), int(np.ceil(self.options.search_px))
+    def correlated(self, image: RayImage) -> tuple[float, Array]:
+        """Largest correlation of an image with the frame within the range of search, and where it is."""
+        half, reach = self.half(image), int(np.ceil(self.options.search_px))
         centre = np.rint(image.point)
         formed = self._formed(image, half, centre)
         sign = -1.0 if self.options.polarity == "dark" else 1.0
@@ -427,33 +404,38 @@ class Run:
         around = np.ascontiguousarray(self.screened.grey[np.ix_(rows, columns)], np.float32)
         score = cv2.matchTemplate(around, (sign * formed).astype(np.float32), cv2.TM_CCOEFF_NORMED)
         row, column = np.unravel_index(int(np.argmax(score)), score.shape)
-        if not score[row, column] > _BEGINNING:
+        return float(score[row, column]), centre + np.array([column - reach, row - reach])
+
+    def _found(self, k: int, image: RayImage) -> Array:
+        """Approximate position of a target; NaN if there is none."""
+        score, place = self.correlated(image)
+        if not score > _BEGINNING:
             self.why[k] = Reason(
                 f"nothing like its image within {self.options.search_px:g} px of the predicted position",
                 Code.NOT_FOUND,
             )
             return np.full(2, np.nan)
-        return np.asarray(centre + np.array([column - reach, row - reach]))
+        return place
 
     def _shape(
         self, rows: Rows, images: list[RayImage], elements: PupilElements, varied: Varied | None
     ) -> RayShapes:
         bright = self.options.polarity == "bright"
-        if varied is None:
+        if varied is None or not varied.names:
             return RayShapes(tuple(images), bright=bright)
         steps = _STEP * np.diag(varied.sigma)
         beside = [(varied.camera(step), varied.camera(-step), 2 * float(step.sum())) for step in steps]
-        motions = []
-        for k in rows:
+        motions: list[list[tuple[Array, Array]]] = [[] for _ in rows]
+        for far, near, by in beside:
             # Relative to the corresponding ray, whose place is the result, whatever the parameters are.
-            changes = []
-            for far, near, by in beside:
-                a, b = (ray_image(camera, self.targets[k], elements).outline for camera in (far, near))
+            ends = (ray_images(camera, [self.targets[k] for k in rows], elements) for camera in (far, near))
+            for motion, a, b in zip(motions, *ends, strict=True):
+                one, other = required_image(a).outline, required_image(b).outline
                 # Elements that are stopped on one side do not move.
-                lit = np.asarray(a.dxy.any(axis=1) & b.dxy.any(axis=1))[:, None] / by
-                changes.append((lit * (a.xy - b.xy), lit * (a.dxy - b.dxy)))
-            motions.append(Outline(*(np.stack(part) for part in zip(*changes, strict=True))))
-        return RayShapes(tuple(images), tuple(motions), bright=bright)
+                lit = np.asarray(one.dxy.any(axis=1) & other.dxy.any(axis=1))[:, None] / by
+                motion.append((lit * (one.xy - other.xy), lit * (one.dxy - other.dxy)))
+        changes = [Outline(*(np.stack(part) for part in zip(*motion, strict=True))) for motion in motions]
+        return RayShapes(tuple(images), tuple(changes), bright=bright)
 
     def _matched(self, shape: RayShapes, start: Array, half: int) -> Matches:
         o = self.options
@@ -555,7 +537,7 @@ class Run:
         # Small targets that are much blurred show the single elements first.
         seen.sort(key=lambda pair: -pair[1].blur / self.targets[pair[0]].extent)
         critical = [k for k, _ in seen[:_CRITICAL]]
-        windows = {k: (self._half(image), np.rint(image.point)) for k, image in seen[:_CRITICAL]}
+        windows = {k: (self.half(image), np.rint(image.point)) for k, image in seen[:_CRITICAL]}
         formed = {k: self._formed(image, *windows[k]) for k, image in seen[:_CRITICAL]}
         for few, many in pairwise(RINGS):
             rings, settled = few, True

@@ -207,7 +207,11 @@ def ray_image(camera: RayMap, target: PlaneTarget, elements: PupilElements) -> R
     >>> bool(np.abs(image.centroid).max() < 1e-9), round(image.blur, 1)
     (True, 5.3)
     """
-    found = ray_images(camera, [target], elements)[0]
+    return required_image(ray_images(camera, [target], elements)[0])
+
+
+def required_image(found: RayImage | Failure) -> RayImage:
+    """Return the image, or raise why there is none as a UsageError."""
     if isinstance(found, Failure):
         raise UsageError(found.reason)
     return found
