@@ -320,7 +320,7 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
             guesses, reduction = (guesses, reduction) if isinstance(again, Failure) else (again, finer)
         results = [_oriented(scan, guess, reduction, options, scale) for guess in guesses]
         if any(results):
-            return in_reading_order(results + rest_of_strip(scan, results, options, _oriented))
+            return in_reading_order(rest_of_strip(scan, results, options, _oriented))
         # The reason why four edges are no frame is more useful than why three of them are none.
         declined = declined or results[:1]
     return declined
