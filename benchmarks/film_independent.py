@@ -3,7 +3,7 @@
 Run from the checkout: ``RESEAU_DATA=… python benchmarks/film_independent.py [--without] [--hard] [--real]
 [--only NAME …] [--each] [--jobs N]``. The frames are those of ``independent/film``. For each class: the
 number of frames to be oriented, those answered and those answered right, rms of the errors of the corners,
-rms of errors over sigmas, and the frames that are wrong by more than 1 px and 5 sigma; then the reason of
+rms of errors over sigmas, and the frames that are wrong by more than 0.5 px and 5 sigma; then the reason of
 each that is missing.
 By default with the format of each frame (``truth.json``), without it, the hard frames and the real ones.
 """
@@ -30,7 +30,7 @@ from reseau.execution import Executor
 from reseau.io.images import open_scan
 from reseau.procedures.film_frame import FrameOptions, FrameResult, orient_scan
 
-MOST_PX, MOST_SIGMAS = 1.0, 5.0
+MOST_PX, MOST_SIGMAS = 0.5, 5.0
 """A corner is wrong if it is off by more than both."""
 _ORDER = ("ul", "ur", "lr", "ll")
 _STATUS = {"oriented": "orient", "three-edges": "three", "declined": "decline"}
@@ -39,7 +39,7 @@ _REAL = ("lex1.jpg", "kino_1267.jpg")
 
 
 def far_off(error: Array, sigma: Array) -> bool:
-    """Whether a corner (n, 2) is off by more than 1 px and 5 sigma; NaN is not."""
+    """Whether a corner (n, 2) is off by more than 0.5 px and 5 sigma; NaN is not."""
     return bool(((np.abs(error) > MOST_PX) & (np.abs(error) > MOST_SIGMAS * sigma)).any())
 
 
@@ -57,7 +57,7 @@ class Answer:
 
     @property
     def wrong(self) -> bool:
-        """Whether a corner is off by more than 1 px and 5 sigma."""
+        """Whether a corner is off by more than 0.5 px and 5 sigma."""
         return far_off(self.error, self.sigma)
 
     @property

@@ -424,7 +424,9 @@ def test_a_scan_that_is_sharper_in_one_direction_has_no_lines_beside_its_edges()
 
 @pytest.mark.slow
 @pytest.mark.parametrize("negative", [False, True])
-def test_grey_values_are_measured_with_the_curve_that_the_file_states(negative: bool) -> None:
+def test_grey_values_are_measured_with_the_curve_that_the_file_states_or_the_edges_show(
+    negative: bool,
+) -> None:
     frame = FilmFrame(32, srgb=True, blur_px=1.2, negative=negative)
     coded = scan_of(frame.scan(), dpi=frame.dpi)
     options = FrameOptions(formats=(frame.format[:2],))
@@ -432,19 +434,18 @@ def test_grey_values_are_measured_with_the_curve_that_the_file_states(negative: 
     for curve in (ToneCurve(None), None):
         (result,) = orient_frames(replace(coded, curve=curve), options)
         outwards.append(np.mean(errors(result, frame) * [[-1, -1], [1, -1], [1, 1], [-1, 1]]))
-    assert abs(outwards[0]) < 0.05
-    assert abs(outwards[1]) > 0.15
+    assert np.abs(outwards).max() < 0.05
 
 
 def test_ends_of_a_wavy_edge_are_as_uncertain_as_it_departs_from_a_line() -> None:
     place, sigma = np.linspace(-1, 1, 300), np.full(300, 0.05)
     noise = np.random.default_rng(0).normal(0, 0.05, 300)
-    none = np.zeros(300), np.zeros((300, 0))
-    _, covariance, departs = departing_line(place, noise, sigma, *none)
+    none = np.zeros(300), np.zeros((300, 0)), np.zeros((300, 0))
+    _, covariance, departs, _ = departing_line(place, noise, sigma, *none)
     assert departs < 0.03
     assert np.sqrt(np.diag(covariance))[:2].max() < 0.03
     # A line through one wave of 0.5 px, weighted evenly, misses its ends by 0.48 px.
-    values, covariance, departs = departing_line(place, noise + 0.5 * np.sin(np.pi * place), sigma, *none)
+    values, covariance, departs, _ = departing_line(place, noise + 0.5 * np.sin(np.pi * place), sigma, *none)
     assert 0.1 < departs < 0.5
     assert (np.abs(values[:2]) < 2 * np.sqrt(np.diag(covariance))[:2]).all()
     assert np.abs(values[:2]).max() < 0.2

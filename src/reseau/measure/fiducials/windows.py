@@ -19,7 +19,7 @@ from ..matching.patches import MatchOptions
 from ..matching.shapes import Window
 from .forms import contours_of, margin_of, outlined, reach_of, shape_of, thicknesses
 from .learnt import OWN_PSF
-from .search import formed_mark, turned
+from .search import formed_mark, same_figure, turned
 
 _HALF = 48
 """Half side of a window in pixels after reduction, to which larger marks are reduced."""
@@ -171,9 +171,9 @@ def match_marks(
     for i, k in enumerate(rows):
         level = int(reduction[i])
         matched, corner, grey = _matched(scan, design, k, linear / level, at[i], level)
-        found.append(matched)
         first.append(corner)
         formed.append(grey + matched.residuals[0])
+        found.append(_odd(matched, formed_mark(design, k, linear / level)))
     spread = _spread_by_grey(found, formed)
     spreads = [spread(grey) for grey in formed]
     on_marks = _on_marks(found, spreads)
@@ -193,6 +193,24 @@ def match_marks(
             place = own @ np.array([[sxx, sxy], [sxy, syy]]) @ own.T
             common[i], cov[i] = share * cov[i] + place, cov[i] + place
     return MatchedMarks(xy, cov, found, reduction.astype(np.float64), common)
+
+
+def _odd(found: Matches, image: NDArray[np.float32]) -> Matches:
+    """The match of a mark with this image; with half a turn that shows the same, what only one side leaves.
+
+    How the mark of a camera differs from its drawing is alike on both sides, and does not displace it.
+    """
+    if not same_figure(image, image[::-1, ::-1], 0.0):
+        return found
+    residuals = found.residuals[0]
+    y, x = (
+        np.rint(2 * at - np.arange(n)).astype(np.intp)
+        for at, n in zip(found.xy[0, ::-1], residuals.shape, strict=True)
+    )
+    inside = np.logical_and.outer((y >= 0) & (y < len(y)), (x >= 0) & (x < len(x)))
+    across = residuals[np.ix_(np.clip(y, 0, len(y) - 1), np.clip(x, 0, len(x) - 1))]
+    across = np.where(inside, across, np.nan)
+    return replace(found, residuals=((residuals - across) / np.sqrt(2))[None])
 
 
 def moves_of(design: FiducialDesign, k: int, linear: Array) -> tuple[Array, float]:

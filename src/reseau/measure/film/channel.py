@@ -21,7 +21,7 @@ from .adjacent_lines import (
 from .border import Band, Border, Film
 from .edges import EdgeProfiles, measure_profiles, merged
 from .lines import Contender, EdgeData, Rival, departing_line, robust_line
-from .steps import STRAIGHT, StepForm, Tone
+from .steps import Curve, Developed, StepForm, Tone
 
 _NEIGHBOURHOOD_PX = 0.05
 """Minimum contribution of an uneven gate and of picture content to the sigma of a profile."""
@@ -66,8 +66,9 @@ _MOST_GOOD = 0.85
 class Channel:
     """Measured edges of one channel: profiles kept, number rejected, reason for a missing edge.
 
-    Also the number of the channel, the polarity of the film, film and picture beside each edge, and the width
-    of a step.
+    Also the number of the channel, the polarity of the film, film and picture beside each edge, the width of
+    a step, and the curve of the grey values if the file does not state it: the one taken, unless they are
+    proportional to the light, and the one that could displace all edges most.
     """
 
     name: str
@@ -78,6 +79,13 @@ class Channel:
     data: list[EdgeData | None]
     rejected: list[int]
     why: list[str]
+    curve: str = ""
+    other: Rival | None = None
+
+    @property
+    def curves(self) -> Array:
+        """What each edge shows of the curves (e, k, 2); see :class:`EdgeData`."""
+        return np.array([each.curves for each in self.data if each is not None])
 
     def doubted(self, other: Channel) -> Channel:
         """The channel with the doubts of one of more contrast: lines that may be hidden beside edges.
@@ -129,10 +137,48 @@ def measure_channel(
     polarity: int,
     reach: float,
     gap: float,
-    tone: Tone = STRAIGHT,
+    curves: Sequence[Curve],
 ) -> Channel:
-    """Profiles of the four edges in one channel that agree with a line through each edge."""
+    """Profiles of the four edges in one channel that agree with a line through each edge.
 
+    Of several `curves` that the grey values may have, that is taken with which the edges are straight: the
+    displacement of steps by another one depends on their contrast.
+    """
+    forms = [each.form for each in curves]
+    prior = np.log([each.prior for each in curves])
+    tried = [_measured(name, band, channel, polarity, reach, gap, forms, 0)]
+    if not any(tried[0].data):
+        return tried[0]
+    if np.argmax(log := prior + tried[0].curves.sum(axis=0)[:, 0]):
+        # What a curve does to a step is computed for the measured one: neither of two curves is favoured.
+        tones = np.array([k > 0 and isinstance(form, Tone) for k, form in enumerate(forms)])
+        second = int(np.argmax(np.where(tones, log, -np.inf)))
+        tried.append(_measured(name, band, channel, polarity, reach, gap, forms, second))
+    log = prior + np.mean([each.curves.sum(axis=0)[:, 0] for each in tried if any(each.data)], axis=0)
+    share = scipy.special.softmax(log)
+    best = int(np.argmax(share))
+    # A blur on the film is one of the light for the scanner.
+    found = tried[-1 if best and isinstance(forms[best], Tone) else 0]
+    data = [own and own.curved(share) for own in found.data]
+    moved = found.curves[..., 1].mean(axis=0) - share @ found.curves[..., 1].mean(axis=0)
+    other = int(np.argmax(np.where(np.arange(len(share)) == best, 0.0, share) * moved**2))
+    rival = Rival(curves[other].name, float(share[other]), float(moved[other]))
+    return replace(found, data=data, curve=curves[best].name if best else "", other=rival)
+
+
+def _measured(
+    name: str,
+    band: Callable[[int, bool, bool], Band | None],
+    channel: int,
+    polarity: int,
+    reach: float,
+    gap: float,
+    forms: Sequence[Tone | Developed],
+    taken: int,
+) -> Channel:
+    """The channel measured with one of the curves."""
+    tone = forms[taken]
+    assert isinstance(tone, Tone)
     pixels = [band(k, False, False) for k in range(4)]
     side = float(
         np.mean([np.hypot(*(each.stop - each.start)) for each in pixels if each is not None] or [1.0])
@@ -171,7 +217,7 @@ def measure_channel(
             found = found if more is None else merged(found, more)
         profiles[k] = found
     edges = [
-        _edge(band(k, False, far[k]), found, soft, channel, polarity)
+        _edge(band(k, False, far[k]), found, soft, channel, polarity, forms, taken)
         for k, (found, soft) in enumerate(zip(profiles, soft_steps(profiles, side), strict=True))
     ]
     data, rejected, why = (list(column) for column in zip(*edges, strict=True))
@@ -193,7 +239,13 @@ def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
 
 
 def _edge(
-    band: Band | None, found: EdgeProfiles | None, soft: Softness, channel: int, polarity: int
+    band: Band | None,
+    found: EdgeProfiles | None,
+    soft: Softness,
+    channel: int,
+    polarity: int,
+    forms: Sequence[Tone | Developed],
+    taken: int,
 ) -> tuple[EdgeData | None, int, str]:
     """Profiles of an edge that agree with its line, or the reason why it is not found."""
     if band is None:
@@ -226,7 +278,11 @@ def _edge(
         covariance = np.diag([0.0, 0.0, soft.width**2 + near[2] ** 2])
         covariance[:2, :2] = two.covariance + common**2 + doubt**2 * np.eye(2)
         xy = band.at(place, -_inward(at, place, 0 * place))
-        return EdgeData(at, covariance, xy, np.zeros(0), 0.0, doubt, rival), rejected, ""
+        return (
+            EdgeData(at, covariance, xy, np.zeros(0), 0.0, doubt, rival, np.zeros((len(forms), 2))),
+            rejected,
+            "",
+        )
     if (beside > 0.5).any() and rival.probability < beside.max():
         # The sigmas of these profiles contain it.
         moved = float(np.abs(moves[beside > 0.5]).max())
@@ -237,15 +293,28 @@ def _edge(
     # A structure of the picture lies inwards of the edge; parts of an edge that is bent lie on both sides.
     used = agree | (agree.mean() < _BENT and not _only_inwards(residuals, line[1]))
     harmonics = band.harmonics(place, offset - residuals)
-    values, covariance, departs = departing_line(
-        *(each[used] for each in (place, offset, own, drawn, harmonics))
+    curved = _curved(found, forms, taken)[found.good]
+    values, covariance, departs, likelihood = departing_line(
+        *(each[used] for each in (place, offset, own, drawn, harmonics, curved))
     )
+    shown = np.stack([likelihood, -np.median(curved[used], axis=0)], axis=1)
     # Steps that are too sharp belong to a scratch and are equally uninformative.
     doubt = float(np.sqrt(doubt**2 + soft.sharpened * soft.width**2))
     covariance[:2, :2] += common**2 + (_MODEL_PX**2 + doubt**2) * np.eye(2)
     rest = _inward(values, place[used], offset[used])
-    data = EdgeData(values, covariance, band.at(place[used], offset[used]), rest, departs, doubt, rival)
+    data = EdgeData(
+        values, covariance, band.at(place[used], offset[used]), rest, departs, doubt, rival, shown
+    )
     return data, rejected + int((~used).sum()), ""
+
+
+def _curved(found: EdgeProfiles, forms: Sequence[Tone | Developed], taken: int) -> Array:
+    """Displacements inwards (n, k) of steps measured with the taken curve, where another one is true."""
+    level = np.full(len(found.place), float(np.median(found.border.level)))
+    away, shown = np.array([each.displaced(level, found.contrast) for each in forms]).transpose(1, 2, 0)
+    # The light is spread alike, whatever the contrast.
+    width = found.width * np.median(shown[:, taken, None] / shown, axis=0)
+    return np.asarray(width * away - found.width * away[:, taken, None])
 
 
 def _rival(

@@ -61,6 +61,8 @@ class EdgeProfiles:
         Position of the step, inwards from the approximate edge, and its standard deviation, pixels.
     good : ndarray of bool (n,)
         Which profiles show a step that can be located.
+    contrast : ndarray (n,)
+        Contrast of the step there, from neighbouring profiles.
     blur : ndarray (2, n)
         Logarithm of the width estimated from a profile and its neighbours alone, and its variance.
     form : StepForm
@@ -73,6 +75,7 @@ class EdgeProfiles:
     offset: Array
     sigma: Array
     good: Mask
+    contrast: Array
     blur: Array
     form: StepForm
     border: Border
@@ -129,7 +132,9 @@ def measure_profiles(
     steps, form = found
     place, sigma = np.where(steps.good, steps.place, 0.0), np.where(steps.good, steps.sigma, 1.0)
     blur = _without_phase(steps, band.harmonics(band.place, _smoothed(place, steps.good)))
-    return EdgeProfiles(band.place, place, sigma, steps.good, blur, form, border)
+    contrast = _along(np.where(steps.good, steps.contrast, np.inf))
+    contrast = np.where(np.isfinite(contrast) & (contrast > 0), contrast, border.contrast)
+    return EdgeProfiles(band.place, place, sigma, steps.good, contrast, blur, form, border)
 
 
 def _without_phase(steps: _Steps, harmonics: Array) -> Array:
@@ -393,12 +398,19 @@ def merged(fine: EdgeProfiles, wide: EdgeProfiles) -> EdgeProfiles:
         lone = wide.good
     place = np.concatenate([fine.place, wide.place[lone]])
     order = np.argsort(place, kind="stable")
-    offset, sigma, good = (
+    offset, sigma, good, contrast = (
         np.concatenate([a, b[lone]])[order]
-        for a, b in ((fine.offset, wide.offset), (fine.sigma, wide.sigma), (fine.good, wide.good))
+        for a, b in (
+            (fine.offset, wide.offset),
+            (fine.sigma, wide.sigma),
+            (fine.good, wide.good),
+            (fine.contrast, wide.contrast),
+        )
     )
     blur = np.concatenate([fine.blur, wide.blur[:, lone]], axis=1)[:, order]
-    return replace(fine, place=place[order], offset=offset, sigma=sigma, good=good, blur=blur)
+    return replace(
+        fine, place=place[order], offset=offset, sigma=sigma, good=good, contrast=contrast, blur=blur
+    )
 
 
 def _window(

@@ -9,9 +9,10 @@ determined.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy
 
 from ...adjust import Adjustment, GaussMarkov, Options, Parameters, adjust
 from ...adjust.outliers import robust
@@ -63,6 +64,9 @@ class EdgeData:
         Standard deviation of its ends by other explanations of the edge, which the covariance contains.
     rival : Rival, optional
         The second best explanation of what is seen.
+    curves : ndarray (k, 2)
+        For each curve of the grey values the logarithm of its likelihood, over that with which the edge was
+        measured, and how far inwards it puts the edge.
     """
 
     line: Array
@@ -72,6 +76,14 @@ class EdgeData:
     departs: float = 0.0
     doubt: float = 0.0
     rival: Rival | None = None
+    curves: Array = field(default_factory=lambda: np.zeros((1, 2)))
+
+    def curved(self, share: Array) -> EdgeData:
+        """The edge in the mean of the curves of the grey values, with these probabilities (k,)."""
+        moves = self.curves[:, 1]
+        mean = float(share @ moves)
+        doubt = float(np.sqrt(self.doubt**2 + share @ (moves - mean) ** 2))
+        return replace(self, line=self.line + mean * np.array([1.0, 1.0, 0.0])).doubted(doubt)
 
     def doubted(self, doubt: float) -> EdgeData:
         """The edge with the doubt of another channel, if it is larger."""
@@ -425,8 +437,8 @@ def _lines(
 
 
 def departing_line(
-    place: Array, offset: Array, sigma: Array, moved: Array, harmonics: Array
-) -> tuple[Array, Array, float]:
+    place: Array, offset: Array, sigma: Array, moved: Array, harmonics: Array, curved: Array
+) -> tuple[Array, Array, float, Array]:
     """Chord and bow of an edge from which profiles depart, and neighbours alike.
 
     What the picture shows beside an edge displaces its steps over some length along it; film and gate are
@@ -441,45 +453,48 @@ def departing_line(
         Sizes of the departures relative to each other.
     harmonics : ndarray (n, m)
         Functions of the phase of the edge on the pixels, with which its steps are displaced alike.
+    curved : ndarray (n, k)
+        Displacements of the steps by each curve that the grey values may have.
 
     Returns
     -------
-    (ndarray (3,), ndarray (3, 3), float)
-        Start, stop and bow, their covariance, and the standard deviation of the departures.
+    (ndarray (3,), ndarray (3, 3), float, ndarray (k,))
+        Start, stop and bow, their covariance, and the standard deviation of the departures; logarithms of the
+        likelihoods of the curves, over that of none.
     """
     order = np.argsort(place, kind="stable")
-    place, offset, sigma, moved, harmonics = (
-        each[order] for each in (place, offset, sigma, moved, harmonics)
+    place, offset, sigma, moved, harmonics, curved = (
+        each[order] for each in (place, offset, sigma, moved, harmonics, curved)
     )
     change = np.abs(np.diff(offset)) / np.hypot(sigma[1:], sigma[:-1])
     weight = (max(1.0, 1.4826 * float(np.median(change))) * sigma) ** -2
     part = np.clip(((place + 1) / 2 * _BINS).astype(np.intp), 0, _BINS - 1)
     total = np.bincount(part, weight, minlength=_BINS)
     seen = total > 0
-    t, y, size, *phase = (
-        np.bincount(part, weight * each, minlength=_BINS)[seen] / total[seen]
-        for each in (place, offset, np.hypot(moved, _NEAREST_PX), *harmonics.T)
-    )
-    design = np.stack([(1 - t) / 2, (1 + t) / 2, -(1 - t**2), *phase, y], axis=1)
+    columns = (place, np.hypot(moved, _NEAREST_PX), *harmonics.T, offset, *(offset[:, None] - curved).T)
+    t, size, *each = (np.bincount(part, weight * c, minlength=_BINS)[seen] / total[seen] for c in columns)
+    phase, last = each[: harmonics.shape[1]], 3 + harmonics.shape[1]
+    design = np.stack([(1 - t) / 2, (1 + t) / 2, -(1 - t**2), *each], axis=1)
     prior = np.diag([1e-6, 1e-6, 1e-4] + [_PHASE_PX**-2] * len(phase))
     alike = np.exp(-np.abs(t[:, None] - t) / _LENGTHS[:, None, None]) * np.outer(size, size)
     covariance = (_TIMES[:, None, None, None] ** 2 * alike).reshape(-1, len(t), len(t))
     covariance += np.diag(1 / total[seen])
     root = np.linalg.cholesky(covariance)
     white = np.linalg.solve(root, np.broadcast_to(design, (len(root), *design.shape)))
-    white, own = white[..., :-1], white[..., -1:]
+    white, own = white[..., :last], white[..., last:]
     normal = white.transpose(0, 2, 1) @ white + prior
     cofactor = np.linalg.inv(normal)
-    found = (cofactor @ white.transpose(0, 2, 1) @ own)[..., 0]
-    rest = (own**2).sum(axis=(1, 2)) - np.einsum("ki,kij,kj->k", found, normal, found)
-    log = -np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-    log -= (np.linalg.slogdet(normal)[1] + rest) / 2
-    share = np.exp(log - log.max())
-    share /= share.sum()
+    every = cofactor @ white.transpose(0, 2, 1) @ own
+    rest = (own**2).sum(axis=1) - (every * (normal @ every)).sum(axis=1)
+    log = -np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1) - np.linalg.slogdet(normal)[1] / 2
+    log = log[:, None] - rest / 2
+    likelihood = scipy.special.logsumexp(log, axis=0)
+    share, found = np.exp(log[:, 0] - likelihood[0]), every[..., 0]
     mean = share @ found
     spread = cofactor + (found - mean)[:, :, None] * (found - mean)[:, None, :]
     departs = np.sqrt(np.repeat(_TIMES**2, len(_LENGTHS)) @ share * np.mean(size**2))
-    return mean[:3], np.tensordot(share, spread, 1)[:3, :3], float(departs)
+    curves = np.asarray(likelihood[1:] - likelihood[0])
+    return mean[:3], np.tensordot(share, spread, 1)[:3, :3], float(departs), curves
 
 
 def derived(corners: Array, covariance: Array) -> tuple[Array, Array, float, float]:

@@ -22,7 +22,7 @@ from .channel import WIDER_SEARCH, Channel, channels_by_contrast, measure_channe
 from .formats import ALL_FORMATS, FORMATS, format_probabilities, scale_by_perforations
 from .lines import EdgeData, FrameShape, Lines, adjust_lines, derived, explained_shape, shape_of
 from .search import FrameGuess, search_frames, size_of
-from .steps import Tone
+from .steps import curves_of
 from .strips import in_reading_order, overview_of, rest_of_strip
 
 if TYPE_CHECKING:
@@ -320,7 +320,7 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
             guesses, reduction = (guesses, reduction) if isinstance(again, Failure) else (again, finer)
         results = [_oriented(scan, guess, reduction, options, scale) for guess in guesses]
         if any(results):
-            return in_reading_order(results + rest_of_strip(scan, results, options, _oriented))
+            return in_reading_order(rest_of_strip(scan, results, options, _oriented))
         # The reason why four edges are no frame is more useful than why three of them are none.
         declined = declined or results[:1]
     return declined
@@ -450,23 +450,38 @@ def _oriented(
     shape = options.shape
     if shape is None or guess.format_mm != (shape.width, shape.height):
         shape = FrameShape(*guess.format_mm, options.aspect_sigma, float(np.deg2rad(options.angle_sigma_deg)))
-    tone = Tone.of_file(scan.curve, scan.full_scale, guess.polarity)
+    curves = curves_of(scan.curve, scan.full_scale, guess.polarity)
     best: FrameResult | None = None
     earlier: list[Channel] = []
     for c in channels_by_contrast([band(k, False) for k in range(4)], len(scan.channels), reach):
         name = scan.channels[c]
-        measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale, tone)
+        measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale, curves)
         for other in earlier:
             measured = measured.doubted(other)
         earlier.append(measured)
         result = _judged(scan, guess, measured, corners, shape, options)
         # Channels are ordered by contrast: a later one must show more edges, or more accurate ones.
         if best is None or _seen(result) > _seen(best):
-            best = result
+            best, said = result, _curve(measured, result)
         if best.status == "oriented" and not best.why:
             break  # other channels show the same edges with less contrast
     assert best is not None
-    return replace(best, place=corners, formats=tuple(formats))
+    why = "; ".join([best.why] * bool(best.why) + said)
+    return replace(best, place=corners, formats=tuple(formats), why=why)
+
+
+def _curve(measured: Channel, result: FrameResult) -> list[str]:
+    """What the edges show of the curve of the grey values that the file does not state."""
+    if result.lines is None:
+        return []
+    text = f"grey values, of which the file states no curve, are taken as {measured.curve}"
+    said, other = [text] * bool(measured.curve), measured.other
+    least = _STATED[1] * float(np.sqrt(np.diag(result.lines.covariance)).max())
+    if other is None or other.probability < _STATED[0]:
+        return said
+    if np.sqrt(other.probability) * abs(other.moved_px) > least:
+        said.append(f"all edges: grey values {other}")
+    return said
 
 
 def _seen(result: FrameResult) -> tuple[int, float]:

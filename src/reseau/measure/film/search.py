@@ -261,7 +261,7 @@ def search_frames(
         warnings.simplefilter("ignore", RuntimeWarning)
         scored = [_judged(guess, grey) for guess in tested]
         good = sorted((g for g in scored if g is not None), key=lambda g: _far(g, near) - g.score)
-        return [_settled(guess, grey) for guess in _apart(good)]
+        return [_settled(guess, grey) for guess in _apart(good, along is not None)]
 
 
 def _far(guess: FrameGuess, near: Array | None) -> float:
@@ -464,18 +464,40 @@ def _distinct(guesses: list[FrameGuess], most: int) -> list[FrameGuess]:
     return kept
 
 
-def _apart(guesses: list[FrameGuess]) -> list[FrameGuess]:
-    """The best guess, and similar ones that do not overlap with it: frames of one strip."""
+def _apart(guesses: list[FrameGuess], together: bool) -> list[FrameGuess]:
+    """The best guess, and similar ones that do not overlap with it: frames of one strip.
+
+    Of a strip they are chosen `together`: a line of a picture makes a guess that displaces two frames.
+    """
     if not guesses:
         return []
     best = guesses[0]
     size = size_of(best.corners)
+    alike = [
+        guess
+        for guess in guesses
+        if guess.polarity == best.polarity
+        and all(guess.supported) == all(best.supported)
+        and np.abs(size_of(guess.corners) / size - 1).max() < 0.04
+    ]
+    if together and len(alike) > 1:
+        pairs = [
+            (i, j)
+            for j, guess in enumerate(alike)
+            for i, other in enumerate(alike[:j])
+            if overlap_of(guess.corners, other.corners) > 0.05
+        ]
+        apart = np.zeros((len(pairs), len(alike)))
+        apart[np.repeat(np.arange(len(pairs)), 2), np.ravel(pairs).astype(np.intp)] = 1.0
+        found = scipy.optimize.milp(
+            [-guess.score for guess in alike],
+            integrality=np.ones(len(alike)),
+            bounds=scipy.optimize.Bounds(0, 1),
+            constraints=scipy.optimize.LinearConstraint(apart, ub=1) if pairs else (),
+        )
+        return [guess for guess, taken in zip(alike, found.x, strict=True) if taken > 0.5]
     kept: list[FrameGuess] = []
-    for guess in guesses:
-        alike = guess.polarity == best.polarity and all(guess.supported) == all(best.supported)
-        alike &= bool(np.abs(size_of(guess.corners) / size - 1).max() < 0.04)
-        if kept and not alike:
-            continue
+    for guess in alike:
         if all(overlap_of(guess.corners, other.corners) < 0.05 for other in kept):
             kept.append(guess)
     return kept

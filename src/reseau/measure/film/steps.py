@@ -16,7 +16,7 @@ the grid to the next, by up to 0.1 px, and neighbouring profiles alike.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,6 +40,12 @@ _SRGB = 2.4, 0.055
 """Exponent of the curve of sRGB above its linear part, and the grey value that is added before."""
 _POWER = 0.01
 """The same for powers."""
+_DENSE, _DENSITIES = 3.0, (2.0, 3.0, 4.0)
+"""The same for densities, and the largest ones of scanners."""
+_SHARES, _DEVELOPED = (0.3, 0.6, 1.0), "proportional to the light, with a penumbra or halation on the film"
+"""Widths of blurs on the film, in those of the steps, and what they are."""
+_WITHIN = 1e-3, 1 - 1e-3
+"""Range of the share of light at the half of a step."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +104,87 @@ class Tone:
         part = np.maximum(self.polarity * light / self.scale, _LEAST_LIGHT) ** (1 / self.gamma)
         return np.asarray(self.polarity * self.scale * ((1 + self.added) * part - self.added))
 
+    def displaced(self, level: Array, contrast: Array) -> tuple[Array, Array]:
+        """How far inwards the half of a step is displaced, and the width it shows, in widths of the light."""
+        low, middle, high = (self.light(level + part * contrast) for part in (0.0, 0.5, 1.0))
+        rise = np.maximum(high - low, 1e-9)
+        away = scipy.special.ndtri(np.clip((middle - low) / rise, *_WITHIN))
+        shown = contrast * self.slope(level + contrast / 2) / rise * np.exp(away**2 / 2)
+        return np.asarray(away), np.asarray(shown)
+
 
 STRAIGHT = Tone()
 """Grey values that are proportional to the light."""
+
+
+@dataclass(frozen=True)
+class Developed:
+    """A blur that the film itself has developed, by the penumbra of the gate or halation.
+
+    It acts on the exposure E. Film has the density 3 / (1 + E^1.6) as a slide, darker than the picture, or
+    2 / (1 + E^−0.95) as a negative: typical curves, of which the unit of E cancels.
+
+    Parameters
+    ----------
+    share : float
+        Width of this blur, in those of the step.
+    scale, polarity
+        As of :class:`Tone`.
+    """
+
+    share: float
+    scale: float
+    polarity: int
+
+    def displaced(self, level: Array, contrast: Array) -> tuple[Array, Array]:
+        """See :meth:`Tone.displaced`."""
+        half, whole = (self._exposure(level, part * contrast) for part in (0.5, 1.0))
+        away = scipy.special.ndtri(np.clip(half / whole, *_WITHIN))
+        return np.asarray(self.share * away), np.ones_like(away)
+
+    def _exposure(self, level: Array, contrast: Array) -> Array:
+        """Exposure of a picture, but for its unit."""
+        through = contrast / self.scale if self.polarity > 0 else 1 - contrast / np.abs(level)
+        density = -np.log10(np.clip(through, 2e-3, 0.98))
+        if self.polarity > 0:
+            return np.asarray(np.maximum(3.0 / density - 1, 1e-3) ** (1 / 1.6))
+        return np.asarray(np.maximum(2.0 / density - 1, 1e-3) ** (-1 / 0.95))
+
+
+class Curve(NamedTuple):
+    """A curve that grey values may have.
+
+    Parameters
+    ----------
+    name : str
+        What they are.
+    form : Tone or Developed
+        By what steps are displaced.
+    prior : float
+        Probability before the edges are seen.
+    """
+
+    name: str
+    form: Tone | Developed
+    prior: float
+
+
+def curves_of(curve: ToneCurve | None, full_scale: float, polarity: int) -> list[Curve]:
+    """The curves that grey values may have where a file states this one; the first without any.
+
+    Densities up to D are powers of a grey value to which much is added: (1 + x/n)ⁿ of D ln 10.
+    """
+    if curve is not None:
+        return [Curve("", Tone.of_file(curve, full_scale, polarity), 1.0)]
+    straight = replace(STRAIGHT, scale=full_scale, polarity=polarity)
+    dense = [replace(straight, gamma=d * float(np.log(10)) * (1 + _DENSE), added=_DENSE) for d in _DENSITIES]
+    return [
+        Curve("proportional to the light", straight, 0.5),
+        Curve("those of sRGB", Tone(*_SRGB, full_scale, polarity), 0.25),
+        Curve("a power of 1.8", replace(straight, gamma=1.8), 0.1),
+        *(Curve(f"densities up to {d:g}", each, 0.03) for d, each in zip(_DENSITIES, dense, strict=True)),
+        *(Curve(_DEVELOPED, Developed(share, full_scale, polarity), 0.02) for share in _SHARES),
+    ]
 
 
 class StepForm(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,8 @@ _FINE, _MOST = 1000, 4000
 """Longer side of the overview of a scan of one frame, and of any, pixels."""
 _LANDSCAPE = 1.5
 """Ratio of the sides of a scan from which it is a strip."""
+_PITCH = 38 / 36
+"""From a frame to the next, in widths of a frame."""
 _ROOM = 0.6
 """Share of a frame for which a scan must have room beside the known ones to show another."""
 _TRIED, _TOLERANCE, _OVERLAPPING = 400, 0.02, 0.1
@@ -39,29 +42,29 @@ def rest_of_strip(
     options: FrameOptions,
     oriented: Callable[[Scan, FrameGuess, float, FrameOptions], FrameResult],
 ) -> list[FrameResult]:
-    """Orient the other frames of a scan, which have the size and the direction of the known ones.
+    """The frames of a scan with the others, which have the size and the direction of the oriented ones.
 
     Parameters
     ----------
     scan : Scan
         The scan.
     known : sequence of FrameResult
-        Frames found without knowledge of others, at least one of them oriented.
+        Frames found without knowledge of others; those that were declined are sought again.
     options : FrameOptions
         Prior knowledge of the frames.
     oriented : callable
         Measures one guess in an overview with its reduction.
     """
     best = next((each for each in known if each.lines is not None and each), None)
-    places = [each.place for each in known if each.place is not None]
+    found = [each for each in known if each]
+    places = [each.place for each in found if each.place is not None]
     if options.near is not None or best is None or best.lines is None or not _room(scan, places):
-        return []
+        return list(known)
     (w, h), corners = best.format_mm or (1.0, 1.0), best.lines.corners
     scale = float(np.mean(size_of(corners) / (w, h)))
     along = corners[1] - corners[0]
     overview, reduction = scan.overview(overview_of(scan, _FINE))
     alike = replace(options, dpi=25.4 * scale, formats=((w, h),))
-    found: list[FrameResult] = []
     for missing in (False, True):
         for guess in search_frames(
             overview,
@@ -110,4 +113,7 @@ def in_reading_order(results: Sequence[FrameResult]) -> list[FrameResult]:
     row = np.zeros(len(y), dtype=np.intp)
     row[order[1:]] = np.cumsum(np.diff(y[order]) > height / 2)
     every = sorted(range(len(y)), key=lambda k: (row[k], x[k]))
-    return [replace(placed[k], frame=i + 1) for i, k in enumerate(every)]
+    # Where a frame was not found between two others its number is left out.
+    width = _PITCH * float(np.median([size_of(each)[0] for each in corners]))
+    away = [1 if row[a] != row[b] else max(1, round((x[b] - x[a]) / width)) for a, b in pairwise(every)]
+    return [replace(placed[k], frame=int(i)) for k, i in zip(every, np.cumsum([1, *away]), strict=True)]
