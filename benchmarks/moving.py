@@ -85,11 +85,12 @@ def drawn(seed: int) -> Done:
     if kind == "stop":
         still = replace(still, stop=1.1 * still.stop)
     camera, planes = camera_of(still), plane_targets(still)
-    job = frame, camera, [str(k) for k in range(len(planes))], planes, BlurredOptions()
+    names = [str(k) for k in range(len(planes))]
+    job = frame, camera, names, planes, BlurredOptions()
     found, alone = measure_explained(*job, refocused=refocused)[0], measure_blurred(*job)
     lines, said = [note.text for note in found.notes], SAID.get(kind)
-    named = bool(lines) and all(said in line for line in lines) if said else not lines
     unlike = any(note.code == Code.INCONSISTENT for note in found.notes)
+    named = bool(lines) and all(said in line for line in lines) if said else unlike == (kind == "stop")
     off, ratio = _errors(found, still.truth)
     return Done(kind, named, unlike, float(found.ok.mean()), off, ratio, _errors(alone, still.truth)[0])
 

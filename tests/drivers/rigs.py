@@ -61,6 +61,15 @@ _ATTEMPTS = 3
 _SERVERS: dict[str, Callable[..., Server]] = {"pty": PtyServer, "tcp": TcpServer, "udp": UdpServer}
 
 
+def _patiently(ready: Callable[[], object]) -> None:
+    """Make an instrument ready: on a loaded machine its first answer may come later than an answer may."""
+    for _ in range(_ATTEMPTS - 1):
+        with suppress(DeadlineError):
+            ready()
+            return
+    ready()
+
+
 @dataclass
 class Rig:
     """A driver, what it drives, and what to do with it.
@@ -155,7 +164,7 @@ def zaber_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
         "roll": AxisPlan(2, 1, per_unit=500.0, high=100.0),
     }
     device = Table("table", Zaber(link_to(address), ANSWER_S), plans, seconds=WORK_S)
-    device.configure(speed=800.0)
+    _patiently(lambda: device.configure(speed=800.0))
     return _table_rig(device, machine, script, server)
 
 
@@ -165,7 +174,7 @@ def smc100_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     device = Table(
         "roll", Smc100(link_to(address), ANSWER_S), {"roll": AxisPlan(1, high=100.0)}, seconds=WORK_S
     )
-    device.configure(speed=800.0)
+    _patiently(lambda: device.configure(speed=800.0))
     return _table_rig(device, machine, script, server)
 
 
@@ -178,7 +187,7 @@ def kinesis_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     if rack:
         plans["roll"] = AxisPlan(2, per_unit=1000.0, high=100.0)
     device = Table("table", Kinesis([link_to(address)], rack=rack, answer_s=ANSWER_S), plans, seconds=WORK_S)
-    device.configure(speed=800.0)
+    _patiently(lambda: device.configure(speed=800.0))
     return _table_rig(device, machine, script, server)
 
 
@@ -205,7 +214,7 @@ def _lines_rig(
         "z": AxisPlan(axis=2, unit="mm", high=100.0),
     }
     device = Table("table", controller(link_to(address, keep_up=True), ANSWER_S), plans, seconds=WORK_S)
-    device.configure(speed=800.0)
+    _patiently(lambda: device.configure(speed=800.0))
     return _table_rig(device, machine, script, server)
 
 
@@ -531,12 +540,6 @@ def rig(driver: str, transport: str, script: FaultScript | None = None) -> Itera
     with ExitStack() as stack:
         made = RIGS[driver, transport](stack, transport, script or FaultScript())
         stack.callback(made.device.close)
-        made.device.connect()
-        # On a loaded machine the first frame may take longer than a frame may.
-        for _ in range(_ATTEMPTS - 1):
-            with suppress(DeadlineError):
-                made.recover()
-                break
-        else:
-            made.recover()
+        _patiently(made.device.connect)
+        _patiently(made.recover)
         yield made

@@ -22,9 +22,9 @@ from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
 from ..exchange.lenses import Lens
 from ..io import ReseauDesign, TestfieldDesign
-from ..measure.blurred import BlurredOptions, estimate_optics
+from ..measure.blurred import BlurredOptions, estimate_optics, measure_blurred
 from ..measure.blurred.measure import BlurredResult, Varied
-from ..measure.blurred.motion import Moving, focus_remark, measure_explained
+from ..measure.blurred.motion import Explained, Moving, focus_remark, measure_explained
 from ..optics import Pose
 from ..optics.formation import mark_outline
 from ..optics.lenses import Paraxial, Prescription, RayMap, ThinLens
@@ -66,7 +66,7 @@ class BlurredFrame:
     rms_px : float
         Root mean square of the residuals of the orientation; NaN where it was given.
     camera : RayMap
-        The lens, with the focus that was estimated.
+        The lens, with the focus and the motion that were estimated.
 
     Examples
     --------
@@ -394,18 +394,19 @@ def measure_blurred_frame(
     False
     """
     options = options or BlurredOptions(polarity=design.polarity)
-    per_line = 0.0 if exposure_lines is None else 2 / exposure_lines
     given = focus_sigma_mm is not None
+    taken = _Frame(frame, design, options, given, 0.0 if exposure_lines is None else 2 / exposure_lines)
     if pose is not None:
         sharpened = _focused(frame, design, camera, pose, options, focus_sigma_mm)
         if isinstance(sharpened, Failure):
             return sharpened
-        found = _measured(frame, design, sharpened[0], pose, options, np.nan, given, per_line)
+        found, _ = taken.measured(sharpened[0], pose, np.nan)
         return _some(_described(_noted(found, [focus_remark(*sharpened[1:])] if given else [])))
     first = (sharp or measurer_of(design))(frame)
     if isinstance(first, Failure):
         return replace(first, reason=f"no approximate positions: {first.reason}")
     points, before, moved = first.points, np.full((len(design.ids), 2), np.inf), 0.0
+    reason: Explained | None = None
     for k in range(_ROUNDS):
         oriented = orient_by_rays(camera, design, points)
         if isinstance(oriented, Failure):
@@ -415,7 +416,7 @@ def measure_blurred_frame(
             return sharpened
         view, by, sigma = sharpened
         moved += by
-        found = _measured(frame, design, view, oriented[0], options, oriented[1], given, per_line)
+        found, reason = taken.measured(view, *oriented, again=k > 0, reason=reason)
         if found.measured.found < _FEWEST:
             return Failure(
                 f"{found.measured.found} of {len(design.ids)} targets are like their images by rays: "
@@ -621,20 +622,28 @@ def _row_in(network: Network, image: str) -> int:
     return rows[0]
 
 
-def _measured(
-    frame: Frame,
-    design: Design,
-    camera: RayMap,
-    pose: Pose,
-    options: BlurredOptions,
-    rms_px: float,
-    focus_given: bool,
-    per_line: float,
-) -> BlurredFrame:
-    names, targets = targets_of(design, pose, camera)
-    inner = camera.camera if isinstance(camera, CalibratedLens) else camera
-    by = refocused if isinstance(inner, LensCamera) and not focus_given else None
-    measured, view = measure_explained(
-        frame, camera, names, targets, options, refocused=by, per_line=per_line
-    )
-    return BlurredFrame(measured, pose, tuple(targets), rms_px, view)
+@dataclass(frozen=True)
+class _Frame:
+    """A frame, its design, and what is known of how it was taken."""
+
+    frame: Frame
+    design: Design
+    options: BlurredOptions
+    focus_given: bool
+    per_line: float
+
+    def measured(
+        self, camera: RayMap, pose: Pose, rms_px: float, again: bool = False, reason: Explained | None = None
+    ) -> tuple[BlurredFrame, Explained | None]:
+        """Measure the targets, or measure them again with what explained their images with another pose."""
+        names, targets = targets_of(self.design, pose, camera)
+        job = self.frame, camera, names, targets, self.options
+        if again:
+            found = measure_blurred(*job)
+            found = found if reason is None else reason.told(found)
+        else:
+            inner = camera.camera if isinstance(camera, CalibratedLens) else camera
+            by = refocused if isinstance(inner, LensCamera) and not self.focus_given else None
+            found, reason = measure_explained(*job, refocused=by, per_line=self.per_line)
+            camera = camera if reason is None else reason.optics.camera
+        return BlurredFrame(found, pose, tuple(targets), rms_px, camera), reason

@@ -27,9 +27,9 @@ from ..core.executors import Executor, Here
 from ..core.failure import Code, Failure, Remark
 from ..io.network import Network1
 from ..io.targets import SpaceTargets
-from ..measure.blurred import BlurredOptions
+from ..measure.blurred import BlurredOptions, measure_blurred
 from ..measure.blurred.measure import BlurredResult
-from ..measure.blurred.motion import measure_explained
+from ..measure.blurred.motion import Explained, measure_explained
 from ..measure.ordinary import ordinary_coordinates
 from ..optics.lenses import RayMap, ThinLens
 from ..optics.lenses.images import PlaneTarget, image_scale
@@ -368,8 +368,20 @@ class _Job(NamedTuple):
     options: BlurredOptions
 
 
-def _measured(job: _Job) -> BlurredResult:
-    return measure_explained(*job)[0]
+class _Again(NamedTuple):
+    """A photograph that was measured before, and what explained it beside its lens."""
+
+    job: _Job
+    reason: Explained | None
+
+
+def _measured(job: _Job | _Again) -> tuple[BlurredResult, Explained | None]:
+    if isinstance(job, _Job):
+        return measure_explained(*job)
+    job, reason = job
+    if reason is None:
+        return measure_blurred(*job), None
+    return reason.told(measure_blurred(*job._replace(camera=reason.on(job.camera)))), reason
 
 
 class _Run:
@@ -396,7 +408,7 @@ class _Run:
             if lens is None:
                 raise UsageError("has no lens", where=f"camera {camera.id}")
             self.cameras[camera.id] = lens
-        self.xyz = network.xyz.copy()
+        self.xyz, self.reasons = network.xyz.copy(), dict[str, Explained | None]()
         self.matching = replace(options.matching, polarity=targets.polarity)
 
     def round(self, last: Result) -> BlurredRound | Failure:
@@ -416,9 +428,14 @@ class _Run:
             if rows:
                 of_image[image] = rows
         jobs = ((image, self._job(last, image, rows)) for image, rows in of_image.items())
-        for image, found in self.executor.outcomes(_measured, jobs):
-            if isinstance(found, Failure):
-                return found
+        # A photograph is explained once: another orientation changes its images hardly.
+        known = (
+            (image, _Again(job, self.reasons[image]) if image in self.reasons else job) for image, job in jobs
+        )
+        for image, outcome in self.executor.outcomes(_measured, known):
+            if isinstance(outcome, Failure):
+                return outcome
+            found, self.reasons[image] = outcome
             measured[image] = found
             for k, own in enumerate(of_image[image]):
                 if self._stays(found, k, own):

@@ -102,9 +102,9 @@ class Moving:
     >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> still = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (0.0, 0.0)))
     >>> moving = Moving(still, Motion(np.array([0, 0.0004, 0, 0, 0, 0]), np.zeros(6)), 9)
-    >>> moving.spots(np.array([[0.0, 0.0, 1000.0]]), PupilElements.gauss(8))[0].shape
-    (9, 1, 65, 2)
-    >>> moving.extent_px(np.array([[0.0, 0.0, 1000.0]])).round(2)
+    >>> moving.spots(np.array([[0.0, 0.0, 1000.0]]), PupilElements.gauss(2))[0].shape
+    (9, 1, 5, 2)
+    >>> round(moving.extent_px(np.array([[0.0, 0.0, 1000.0]])), 2)
     4.16
     """
 
@@ -217,6 +217,35 @@ class Explained:
     kind: Kind
     optics: EstimatedOptics
     extent_px: float
+
+    def on(self, camera: RayMap) -> RayMap:
+        """Return the map of rays of another estimate of the orientation, with the same motion."""
+        view = self.optics.camera
+        return replace(view, camera=camera) if isinstance(view, Moving) else camera
+
+    def told(self, found: BlurredResult) -> BlurredResult:
+        """Return what was measured with it, with what is said of it, and with its uncertainty."""
+        # Errors of common parameters displace all targets about alike.
+        shift = np.mean(list(self.optics.shifts.values()), axis=0)
+        cov = found.cov + shift.T @ self.optics.cov @ shift
+        return replace(found, cov=cov, notes=(*self._said(), *found.notes))
+
+    def _said(self) -> list[Remark]:
+        kind, optics, said = self.kind, self.optics, []
+        if kind.way:
+            rest = kind.way == "vibration"
+            how, when = ("vibrated", "rest") if rest else ("moved", "the mean time of the exposure")
+            over = f"the image {how} over {self.extent_px:.2g} px during the exposure"
+            said.append(Remark(f"{over}: coordinates are those at {when}", Code.BLURRED))
+        if kind.focus:
+            said.append(focus_remark(float(optics.values[0]), float(optics.sigma[0])))
+        return said
+
+
+def focus_remark(by_mm: float, sigma_mm: float) -> Remark:
+    """Return what is said of an estimated focus."""
+    text = f"the focus was estimated: {by_mm:.4f} ± {sigma_mm:.4f} mm behind the stated image surface"
+    return Remark(text, Code.BLURRED)
 
 
 def _steps(extent_px: float) -> int:
@@ -406,7 +435,7 @@ def explained(
     >>> noise = np.random.default_rng(0).normal(0.0, 1.0, share.shape)
     >>> found = explained(Frame(200 - 150 * share + noise, 255.0), camera, [disk])
     >>> found.kind.way, round(found.extent_px, 1)
-    ('path', 4.0)
+    ('path', 4.1)
     """
     compared = _Compared(frame, camera, targets, options or BlurredOptions(), refocused, per_line)
     if not compared.targets:
@@ -441,7 +470,7 @@ def measure_explained(
     *,
     refocused: Callable[[RayMap, float], RayMap] | None = None,
     per_line: float = 0.0,
-) -> tuple[BlurredResult, RayMap]:
+) -> tuple[BlurredResult, Explained | None]:
     """Measure blurred targets; where the lens alone does not explain their images, with what does.
 
     Parameters
@@ -453,8 +482,8 @@ def measure_explained(
 
     Returns
     -------
-    (BlurredResult, RayMap)
-        With a note on what was explained, and the map of rays that contains it.
+    (BlurredResult, Explained or None)
+        With a note on what was explained, and the explanation.
 
     Examples
     --------
@@ -463,33 +492,9 @@ def measure_explained(
     found = measure_blurred(frame, camera, ids, targets, options)
     like = bool(found.ok.any()) and not found.notes
     # A stand-in does not know the form of an image: what it leaves says nothing about a motion.
-    if like or camera.unknown > 0 or isinstance(camera, Moving) or options.varied is not None:
-        return found, camera
+    if like or camera.unknown > 0 or options.varied is not None:
+        return found, None
     reason = explained(frame, camera, targets, options, refocused=refocused, per_line=per_line)
     if reason is None:
-        return found, camera
-    optics = reason.optics
-    again = measure_blurred(frame, optics.camera, ids, targets, options)
-    # Errors of common parameters displace all targets about alike.
-    shift = np.mean(list(optics.shifts.values()), axis=0)
-    cov = again.cov + shift.T @ optics.cov @ shift
-    return replace(again, cov=cov, notes=(*_said(reason), *again.notes)), optics.camera
-
-
-def focus_remark(by_mm: float, sigma_mm: float) -> Remark:
-    """Return what is said of an estimated focus."""
-    text = f"the focus was estimated: {by_mm:.4f} ± {sigma_mm:.4f} mm behind the stated image surface"
-    return Remark(text, Code.BLURRED)
-
-
-def _said(reason: Explained) -> list[Remark]:
-    """What is said of an explanation."""
-    kind, optics, said = reason.kind, reason.optics, []
-    if kind.way:
-        rest = kind.way == "vibration"
-        how, when = ("vibrated", "rest") if rest else ("moved", "the mean time of the exposure")
-        over = f"the image {how} over {reason.extent_px:.2g} px during the exposure"
-        said.append(Remark(f"{over}: coordinates are those at {when}", Code.BLURRED))
-    if kind.focus:
-        said.append(focus_remark(float(optics.values[0]), float(optics.sigma[0])))
-    return said
+        return found, None
+    return reason.told(measure_blurred(frame, reason.optics.camera, ids, targets, options)), reason
