@@ -451,7 +451,7 @@ def _oriented(
     shape = options.shape
     if shape is None or guess.format_mm != (shape.width, shape.height):
         shape = FrameShape(*guess.format_mm, options.aspect_sigma, float(np.deg2rad(options.angle_sigma_deg)))
-    curves = curves_of(scan.curve, scan.full_scale, guess.polarity)
+    curves = curves_of(scan.curve, scan.full_scale, guess.polarity, whole=scan.dtype.kind != "f")
     best: FrameResult | None = None
     earlier: list[Channel] = []
     for c in channels_by_contrast([band(k, False) for k in range(4)], len(scan.channels), reach):

@@ -169,12 +169,15 @@ class Curve(NamedTuple):
     prior: float
 
 
-def curves_of(curve: ToneCurve | None, full_scale: float, polarity: int) -> list[Curve]:
+def curves_of(
+    curve: ToneCurve | None, full_scale: float, polarity: int, *, whole: bool = True
+) -> list[Curve]:
     """The curves that grey values may have where a file states this one; the first without any.
 
     Densities up to D are powers of a grey value to which much is added: (1 + x/n)ⁿ of D ln 10.
     """
-    if curve is not None:
+    # Numbers in floating point have no full scale to which a curve could refer: they are light.
+    if curve is not None or not whole:
         return [Curve("", Tone.of_file(curve, full_scale, polarity), 1.0)]
     straight = replace(STRAIGHT, scale=full_scale, polarity=polarity)
     dense = [replace(straight, gamma=d * float(np.log(10)) * (1 + _DENSE), added=_DENSE) for d in _DENSITIES]
