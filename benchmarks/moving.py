@@ -1,6 +1,6 @@
 """Blurred targets that moved during the exposure, in photographs drawn with rays of batoid.
 
-Run from the checkout: ``python benchmarks/moving.py [--count 12] [--first 0]``; needs batoid. The photographs
+Run from the checkout: ``python benchmarks/moving.py [--count 14] [--first 0]``; needs batoid. The photographs
 are those of ``benchmarks/blurred.py`` (double Gauss, twelve disks and squares tilted to 40°, blur of 3 or 6
 px), 40 dB, drawn at 41 places of the image along its way. Kinds, in turn: at rest; straight; curved or
 accelerated; vibrations along a line and along an ellipse, with amplitudes of 1 to 5 px; a focus other than

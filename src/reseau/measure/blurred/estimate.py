@@ -182,8 +182,9 @@ class _Common:
         normal, right = np.zeros((len(values),) * 2), np.zeros(len(values))
         for part in parts:
             normal, right = normal + part.normal, right + part.right
-        names = "cost", "freedom", "shifts"
-        return cls(normal, right, *({part.row: getattr(part, name) for part in parts} for name in names))
+        costs = {part.row: part.cost for part in parts}
+        free = {part.row: part.freedom for part in parts}
+        return cls(normal, right, costs, free, {part.row: part.shifts for part in parts})
 
     def better(self, before: _Common, prior: Array, old: Array, new: Array) -> bool:
         """Whether more targets are like their images, or the same ones more alike."""

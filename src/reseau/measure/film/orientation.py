@@ -295,8 +295,7 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
 
     Examples
     --------
-    A frame of 36 mm × 24 mm, brighter than the film around it; how its grey values follow the light is not
-    stated:
+    A frame of 36 mm × 24 mm, brighter than the film around it, in grey values proportional to the light:
 
     >>> from reseau.io.scans import scan_of
     >>> from reseau.optics.formation import draw, rectangles
@@ -304,8 +303,8 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
     >>> grey = 60 + 120 * frame + np.random.default_rng(0).normal(0, 2, frame.shape)
     >>> near = np.array([[20.0, 20.0], [163.0, 20.0], [163.0, 115.0], [20.0, 115.0]])
     >>> options = FrameOptions(formats=((36.0, 24.0),), near=near)
-    >>> (found,) = orient_frames(scan_of(grey.astype(np.uint8)), options)
-    >>> found.status, bool(abs(found.lines.corners[0] - 19.5).max() < 0.3)
+    >>> (found,) = orient_frames(scan_of(grey.astype(np.float32)), options)
+    >>> found.status, bool(abs(found.lines.corners[0] - 19.5).max() < 0.1)
     ('oriented', True)
     """
     options = options or FrameOptions()
