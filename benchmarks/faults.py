@@ -26,8 +26,8 @@ def main() -> int:
     if asked.exchanges:
         os.environ["RESEAU_EXCHANGES"] = str(asked.exchanges)
         which = ["-k", "a_fault_gives or endurance", "-m", "slow or not slow"]
-    battery = str(ROOT / "tests" / "drivers" / "test_battery.py")
-    status = pytest.main(["-q", "-n", "2", *which, battery, "--evidence", str(asked.out.resolve())])
+    battery = [str(path) for path in sorted((ROOT / "tests" / "drivers").glob("test_battery_*.py"))]
+    status = pytest.main(["-q", "-n", "2", *which, *battery, "--evidence", str(asked.out.resolve())])
     print(asked.out.read_text())
     return int(status)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,11 +11,13 @@ import pytest
 from reseau.core.memory import keep_loaded
 from reseau_sims.serving import KINDS
 
+from .rigs import aravis_is_missing, left_open, rig
+
 HEAD = """\
 # Faults and reactions of drivers
 
 Written by `python benchmarks/faults.py --exchanges 10000`; each cell is one or more tests of
-`test_battery.py`. A fault affects an answer during the work of the driver: in process the 1st, 2nd, 3rd and
+`test_battery_*.py`. A fault affects an answer during the work of the driver: in process the 1st, 2nd, 3rd and
 5th answer, otherwise the 3rd. A cell contains the outcome and the longest time until it was known: *right*
 (the work succeeded as without the fault), or the class of the error, which names instrument and command. Time
 limits are short in these tests: 0.5 s for an answer of Zaber, SMC100, Ping360 and CompactPulser, 0.5 s for a
@@ -112,3 +116,24 @@ def _cell(found: list[tuple[str, float]]) -> str:
     for outcome, seconds in found:
         longest[outcome] = max(longest.get(outcome, 0.0), seconds)
     return "; ".join(f"{outcome} {seconds:.1f} s" for outcome, seconds in sorted(longest.items())) or "–"
+
+
+@pytest.fixture(scope="session")
+def libraries_are_loaded() -> None:
+    """What libraries open once for the process (libusb, GLib) is not counted."""
+    with rig("oscilloscope", "vxi-11"), rig("oscilloscope", "hislip"):
+        pass
+    if not aravis_is_missing():
+        with rig("aravis", "gige"):
+            pass
+
+
+@pytest.fixture
+def nothing_is_left_open(libraries_are_loaded: None, request: pytest.FixtureRequest) -> Iterator[None]:
+    before = left_open()
+    yield
+    deadline = time.monotonic() + 5.0
+    while left_open() != before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    request.node.user_properties.append(("nothing left open", left_open() == before))
+    assert left_open() == before

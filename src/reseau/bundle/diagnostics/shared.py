@@ -97,8 +97,8 @@ class SharedErrors:
         View of each image; those from which the errors were estimated come first.
     scores : Scores
         Of the parameters of the cameras, as effects of each of these views.
-    pulls : ndarray (v, q, q)
-        Covariances of these scores by the shared errors.
+    pulls : ndarray (v · q, v · q)
+        Covariance of these scores by the shared errors.
     """
 
     fit: BundleFit
@@ -198,8 +198,9 @@ class SharedErrors:
 
     def _factors(self, columns: Rows, directions: Array, camera: Rows, count: Rows) -> tuple[Array, Array]:
         """Factors on the shared errors in each direction (k,), and relative variances of their squares."""
-        groups, width = self.pulls.shape[:2]
-        if not width:
+        width = int(count.max(initial=0))
+        groups = len(self.pulls) // max(width, 1)
+        if not groups:
             return np.ones(len(columns)), np.zeros(len(columns))
         by_image = np.zeros((groups, width, len(columns)))
         place = {column: k for k, column in enumerate(columns.tolist())}
@@ -208,27 +209,30 @@ class SharedErrors:
             for q in range(int(count[c]) if camera[c] >= 0 else 0):
                 by_image[i, q, place[int(camera[c]) + q]] = 1.0
         turned = by_image @ directions
-        g = np.einsum("iq,iqk->ik", self.scores.g.reshape(groups, width), turned) ** 2 / self.variance
-        k = np.arange(groups)
-        m = self.scores.m.reshape(groups, width, groups, width)[k, :, k, :]
-        own = np.einsum("iqk,iqr,irk->ik", turned, m, turned)
+        g = np.einsum("iq,iqk->ik", self.scores.g.reshape(groups, width), turned)
+        blocks = (groups, width, groups, width)
+        own, shared = (
+            np.einsum("iqk,iqjr,jrk->kij", turned, m.reshape(blocks), turned, optimize=True)
+            for m in (self.scores.m, self.pulls)
+        )
+        grid = np.linspace(np.log(0.05), np.log(5.0), 160)
+        # The sum of squares over the images is what the parameters are pulled by: as many as are about equal.
+        squares = (g**2).sum(axis=0) / self.variance
+        total = own + shared
+        many = np.trace(total, axis1=1, axis2=2) ** 2 / np.maximum((total**2).sum(axis=(1, 2)), 1e-300)
+        own, shared = (np.maximum(np.trace(m, axis1=1, axis2=2), 0.0) for m in (own, shared))
         # Where no image that was looked at has a score, there is nothing but rounding errors.
         own = np.maximum(own, 1e-12 * float(own.max(initial=1e-88)))
-        shared = np.maximum(np.einsum("iqk,iqr,irk->ik", turned, self.pulls, turned), 0.0)
-        grid = np.linspace(np.log(0.05), np.log(5.0), 160)
-        # The sum over the images is what the parameters are pulled by: as many squares as are about equal.
-        squares = g.sum(axis=0)
-        many = (own + shared).sum(axis=0) ** 2 / ((own + shared) ** 2).sum(axis=0)
-        var = own.sum(axis=0) + np.exp(2 * grid)[:, None] * shared.sum(axis=0)
+        var = own + np.exp(2 * grid)[:, None] * shared
         log = -0.5 * many * (np.log(var) + squares / var)
         together = grid[int(np.argmax(log.sum(axis=1)))]
         log = log - 0.5 * ((grid[:, None] - together) / _SHAPE) ** 2
         weight = np.exp(log - log.max(axis=0))
         weight /= weight.sum(axis=0)
-        # The mean of the variance over what the scores leave possible.
-        size = np.sqrt((weight * np.exp(2 * grid)[:, None]).sum(axis=0))
-        log_mean = (weight * grid[:, None]).sum(axis=0)
-        return size, 4 * (weight * (grid[:, None] - log_mean) ** 2).sum(axis=0)
+        # A variance for Student's distribution: the inverse of the mean of inverses over what scores leave.
+        inverse = np.exp(-2 * grid)[:, None]
+        mean = (weight * inverse).sum(axis=0)
+        return mean**-0.5, (weight * (inverse / mean - 1) ** 2).sum(axis=0)
 
 
 def _degrees(parts: Array, spread: Array) -> Array:
@@ -309,12 +313,11 @@ def shared_errors(fit: BundleFit) -> SharedErrors | None:
     variance, spread = _information(joint, parts, best)
     every_size = np.array([sizes for sizes, *_ in fits])
     width = own.slope.shape[2]
-    pulls = np.zeros((groups, width, width))
+    pulls = np.zeros((groups * width, groups * width))
     by_image = parts[1].stop
     for weight, sizes, (*_, seen) in zip(weights, every_size, fits, strict=True):
         half = np.repeat(sizes[:2], [count, by_image - count])[:, None] * seen[:by_image]
-        half = half.reshape(by_image, groups, width)
-        pulls += weight * np.einsum("niq,nir->iqr", half, half)
+        pulls += weight * (half.T @ half)
     distance_size = float(np.sqrt(weights @ every_size[:, 1] ** 2))
     points_size = float(np.sqrt(weights @ every_size[:, 2] ** 2)) if len(some) > 2 else 0.0
     by_camera = every.part(slice(end, None))
