@@ -13,9 +13,9 @@ from reseau.core.errors import UsageError
 from reseau.core.failure import Code, Failure
 from reseau.measure.blurred import BlurredOptions, estimate_optics, measure_blurred
 from reseau.measure.blurred.estimate import EstimatedOptics
-from reseau.measure.blurred.likeness import Residuals
+from reseau.measure.blurred.likeness import Residuals, widths_differ
 from reseau.measure.blurred.measure import Varied
-from reseau.measure.blurred.motion import Motion, Moving, measure_explained
+from reseau.measure.blurred.motion import Motion, Moving, explained, measure_explained
 from reseau.measure.blurred.shapes import RayShapes
 from reseau.measure.matching.shapes import Window
 from reseau.optics.formation import Outline, PixelResponse
@@ -24,6 +24,7 @@ from reseau.optics.lenses.images import PlaneTarget
 from reseau.optics.lenses.media import Cauchy
 from reseau.optics.lenses.prescription import Surface
 from reseau.optics.lenses.ray_maps import LensCamera, SensorPlane
+from reseau.procedures.blurred import refocused
 
 from . import blurs
 
@@ -141,6 +142,21 @@ def test_motion_explains_what_a_lens_at_rest_does_not(steps: Array, said: str) -
     assert [said in note.text for note in found.notes] == [True] * bool(said)
     assert (reason is not None) == bool(said)
     assert np.abs(found.xy[0] - blurs.principal_pixel(CENTRE)).max() < 0.02
+
+
+@pytest.mark.slow
+def test_a_stop_that_is_stated_too_wide_is_told_by_the_form_of_an_image() -> None:
+    reason = explained(photograph(), refocused(camera(), 0.0, np.log(1.1)), [target()], altered=refocused)
+    assert reason is not None
+    assert reason.kind.lens == ("stop",)
+    optics = reason.optics
+    assert abs(optics.values[0] + np.log(1.1)) < 3 * optics.sigma[0] < 0.1
+
+
+def test_widths_that_differ_by_more_than_their_sigmas_are_not_one_width() -> None:
+    width = 0.45 * np.exp(0.01 * np.random.default_rng(0).normal(size=12))
+    assert not widths_differ(width, np.full(12, 0.01), 20000)
+    assert widths_differ(width + np.linspace(0, 0.05, 12), np.full(12, 0.01), 20000)
 
 
 def test_lines_that_are_exposed_later_see_the_target_where_it_is_then() -> None:

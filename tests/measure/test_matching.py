@@ -378,7 +378,18 @@ def test_a_mark_without_a_finite_influence_leaves_the_covariances_of_the_others(
     cov, influence = np.tile(np.eye(2), (30, 1, 1)), np.stack([window, window], axis=1) / 17
     columns = (one, one, one, one, none, one, one, one, 0 * one)
     found = Matches(
-        *(np.zeros((30, 2)), cov, *columns, one > 0, alike, none, np.zeros((30, 2, 0)), influence, 0 * window)
+        *(
+            np.zeros((30, 2)),
+            cov,
+            *columns,
+            one > 0,
+            alike,
+            none,
+            np.zeros((30, 2, 0)),
+            influence,
+            0 * window,
+            one,
+        )
     )
     others = np.setdiff1d(np.arange(30), 3)
     usual = with_alike_errors(found.select(others))

@@ -432,14 +432,16 @@ def measure_blurred_frame(
     return _some(_described(_noted(found, [*notes, focus_remark(moved, sigma)] if given else notes)))
 
 
-def refocused(camera: RayMap, by_mm: float) -> RayMap:
-    """A lens with its image surface moved along the light.
+def refocused(camera: RayMap, by_mm: float, wider: float = 0.0) -> RayMap:
+    """A lens with its image surface moved along the light, and another stop.
 
     Parameters
     ----------
     camera : RayMap
         A lens, also with the places of a calibration.
     by_mm : float
+    wider : float
+        Logarithm of the factor on the radius of the stop.
 
     Raises
     ------
@@ -456,11 +458,14 @@ def refocused(camera: RayMap, by_mm: float) -> RayMap:
     102.5
     """
     if isinstance(camera, CalibratedLens | Moving):
-        return replace(camera, camera=refocused(camera.camera, by_mm))
+        return replace(camera, camera=refocused(camera.camera, by_mm, wider))
     if not isinstance(camera, LensCamera):
         raise UsageError("has no image surface to be moved", where=type(camera).__name__)
     image = camera.lens.surfaces[-1]
-    return replace(camera, lens=camera.lens.moved((by_mm * image.axes[:, 2]).tolist()))
+    lens = camera.lens.moved((by_mm * image.axes[:, 2]).tolist())
+    if wider and lens.stop_radius is not None:
+        lens = replace(lens, stop_radius=lens.stop_radius * np.exp(wider))
+    return replace(camera, lens=lens)
 
 
 def _focused(
@@ -644,6 +649,6 @@ class _Frame:
         else:
             inner = camera.camera if isinstance(camera, CalibratedLens) else camera
             by = refocused if isinstance(inner, LensCamera) and not self.focus_given else None
-            found, reason = measure_explained(*job, refocused=by, per_line=self.per_line)
+            found, reason = measure_explained(*job, altered=by, per_line=self.per_line)
             camera = camera if reason is None else reason.optics.camera
         return BlurredFrame(found, pose, tuple(targets), rms_px, camera), reason

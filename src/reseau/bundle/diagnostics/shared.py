@@ -151,8 +151,7 @@ class SharedErrors:
         inverse = np.linalg.inv(root)
         b, turn = np.linalg.eigh(inverse @ shared @ inverse.T)
         directions, b = root @ turn, np.maximum(b, 0.0)
-        sizes, relative = self._factors(columns, directions, unknowns.camera, unknowns.count)
-        own = sizes**2 * b
+        own, relative = self._scaled(columns, directions, b, unknowns.camera, unknowns.count)
         parts = np.concatenate(
             [self.variance * q[None], target[None], self.variance * own[:, None, None]
              * directions.T[:, :, None] * directions.T[:, None, :]]
@@ -196,12 +195,14 @@ class SharedErrors:
         own = sensitivities(self.fit, effect, columns) * _one_unit(effect, sigma_seen(self.fit))
         return np.asarray(self.variance * self.points**2 * (own @ own.T))
 
-    def _factors(self, columns: Rows, directions: Array, camera: Rows, count: Rows) -> tuple[Array, Array]:
-        """Factors on the shared errors in each direction (k,), and relative variances of their squares."""
+    def _scaled(
+        self, columns: Rows, directions: Array, b: Array, camera: Rows, count: Rows
+    ) -> tuple[Array, Array]:
+        """Variances by shared errors in each direction (k,), b where they have the form assumed; spreads."""
         width = int(count.max(initial=0))
         groups = len(self.pulls) // max(width, 1)
         if not groups:
-            return np.ones(len(columns)), np.zeros(len(columns))
+            return b, np.zeros(len(columns))
         by_image = np.zeros((groups, width, len(columns)))
         place = {column: k for k, column in enumerate(columns.tolist())}
         for i in range(groups):
@@ -229,10 +230,12 @@ class SharedErrors:
         log = log - 0.5 * ((grid[:, None] - together) / _SHAPE) ** 2
         weight = np.exp(log - log.max(axis=0))
         weight /= weight.sum(axis=0)
-        # A variance for Student's distribution: the inverse of the mean of inverses over what scores leave.
-        inverse = np.exp(-2 * grid)[:, None]
-        mean = (weight * inverse).sum(axis=0)
-        return mean**-0.5, (weight * (inverse / mean - 1) ** 2).sum(axis=0)
+        # Middle and spread of logarithms: Student's distribution is wide by its degrees of freedom, not by a
+        # larger variance, too.
+        total = np.log1p(np.exp(2 * grid)[:, None] * b)
+        middle = (weight * total).sum(axis=0)
+        found, spread = np.expm1(middle), (weight * (total - middle) ** 2).sum(axis=0)
+        return found, spread * (np.exp(middle) / np.maximum(found, 1e-12)) ** 2
 
 
 def _degrees(parts: Array, spread: Array) -> Array:

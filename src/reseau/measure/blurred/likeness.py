@@ -5,6 +5,9 @@ them, in units of the noise of each grey value, or they are larger there, for le
 others. The noise follows from differences of adjacent residuals, which the misfit of a blurred image, itself
 smooth, hardly changes; the misfit shows in means over blocks, in which the noise is small. Noise that
 neighbours have in common is in the means beside the targets, too.
+
+What blurs beside the rays can take a part of their blur: then it is another from target to target. That all
+have one width competes with a width of each (Schwarz 1978).
 """
 
 from __future__ import annotations
@@ -137,3 +140,10 @@ class Residuals:
         return Likeness(
             float(np.sqrt(each[0] / each[1])), bool(each[0] > each[1] and gain > np.log(free.sum()))
         )
+
+
+def widths_differ(psf_px: Array, log_sigma: Array, pixels: int) -> bool:
+    """Whether what blurs beside the rays (n,) has another width at each target, rather than one at all."""
+    log, weight = np.log(psf_px), log_sigma**-2.0
+    off = log - (weight @ log) / weight.sum()
+    return bool(weight @ off**2 > (len(log) - 1) * np.log(pixels))

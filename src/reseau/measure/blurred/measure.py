@@ -24,7 +24,7 @@ from ..matching.patches import MatchOptions
 from ..mosaic import balanced
 from ..points import Measured, Reason
 from ..screening import Screened, screen
-from .likeness import Likeness, Residuals
+from .likeness import Likeness, Residuals, widths_differ
 from .shapes import RayShapes
 
 _WINDOWS = (8, 10, 12, 14, 17, 20, 24, 28, 34, 40, 48, 57, 68, 81, 96, 115, 137, 160)
@@ -302,7 +302,7 @@ class Run:
             deviation=np.where(self.ok[:, None], self.columns["xy"] - self.predicted, np.nan),
             rings=rings,
             misfit=likeness.misfit,
-            notes=self._notes(likeness),
+            notes=self._notes(likeness, results),
             **cast(Any, self.columns),
         )
 
@@ -508,15 +508,27 @@ class Run:
                 left.append(Residuals.of(self.screened.grey, start[good], found.residuals[good]))
         return Residuals.likeness(left) if left else Likeness(float("nan"), False)
 
-    def _notes(self, likeness: Likeness) -> tuple[Remark, ...]:
+    def _notes(self, likeness: Likeness, results: list[tuple[Rows, Array, Matches]]) -> tuple[Remark, ...]:
         """Say if the images of all targets differ from those formed."""
+        said = f"residuals of targets are {likeness.misfit:.3g} times the noise beside them"
         if not likeness.unlike:
-            return ()
-        text = (
-            f"residuals of targets are {likeness.misfit:.3g} times the noise beside them: lens, focus or "
-            "aperture are not those of the photograph, and places may be wrong by more than their sigmas"
+            good = [found.select(self.ok[rows]) for rows, _, found in results]
+            width, sigma = (
+                np.concatenate([getattr(found, name) for found in good] or [np.zeros(0)])
+                for name in ("psf_px", "psf_log_sigma")
+            )
+            pixels = sum(int(np.isfinite(found.residuals).sum()) for found in good)
+            # A stand-in leaves much, and not the same everywhere.
+            if len(width) < 2 or self.camera.unknown > 0 or not widths_differ(width, sigma, pixels):
+                return ()
+            said = (
+                f"what blurs beside the rays is {width.min():.2g} px wide at one target and "
+                f"{width.max():.2g} px at another"
+            )
+        unlike = "lens, focus or aperture are not those of the photograph"
+        return (
+            Remark(f"{said}: {unlike}, and places may be wrong by more than their sigmas", Code.INCONSISTENT),
         )
-        return (Remark(text, Code.INCONSISTENT),)
 
     def _images(self) -> tuple[int, PupilElements, list[RayImage | None]]:
         """Rings of elements of the stop, these elements, and images of all targets.

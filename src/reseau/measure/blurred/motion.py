@@ -38,8 +38,9 @@ _PRIOR_PX = 5.0
 _STARTS_PX = (1.0, 2.5, 6.0)
 """Amplitudes from which an estimate begins; at rest no direction is better than another."""
 _DIRECTIONS = 4
-_FOCUS_MM = 0.2
-"""Standard deviation of the place of the image surface."""
+_OF_LENS = {"focus": 0.2, "stop": 0.2}
+"""Standard deviations of what a lens may have another of: the place of its image surface, mm, and the
+logarithm of the radius of its stop."""
 _MOST, _FEW = 8, 3
 """Targets by which explanations are compared, and by which approximate values are found."""
 _COARSE = 2
@@ -165,8 +166,8 @@ class Kind:
 
     Parameters
     ----------
-    focus : bool
-        Another place of the image surface.
+    lens : tuple of str
+        ``focus``: another place of the image surface; ``stop``: another radius of the stop.
     way : {"", "path", "vibration"}
     degree : int
         Of the motion: along one direction, or two.
@@ -175,11 +176,11 @@ class Kind:
 
     Examples
     --------
-    >>> Kind(way="path").parameters, [kind.way for kind in Kind().larger(True)]
-    (2, ['', 'path', 'vibration'])
+    >>> Kind(way="path").parameters, [kind.lens or kind.way for kind in Kind().larger(True)]
+    (2, [('focus',), ('stop',), 'path', 'vibration'])
     """
 
-    focus: bool = False
+    lens: tuple[str, ...] = ()
     way: Literal["", "path", "vibration"] = ""
     degree: int = 1
     twists: int = 2
@@ -187,11 +188,12 @@ class Kind:
     @property
     def parameters(self) -> int:
         """Their number."""
-        return self.focus + (self.degree * self.twists if self.way else 0)
+        return len(self.lens) + (self.degree * self.twists if self.way else 0)
 
-    def larger(self, focus: bool) -> list[Kind]:
-        """Return explanations with one thing more."""
-        found = [replace(self, focus=True)] if focus and not self.focus else []
+    def larger(self, lens: bool) -> list[Kind]:
+        """Return explanations with one thing more; of the lens only if it is in question."""
+        more = [name for name in _OF_LENS if lens and name not in self.lens]
+        found = [replace(self, lens=(*self.lens, name)) for name in more]
         if not self.way:
             return [*found, replace(self, way="path"), replace(self, way="vibration")]
         # What looks like one way along a line may be a part of the other.
@@ -237,14 +239,20 @@ class Explained:
             how, when = ("vibrated", "rest") if rest else ("moved", "the mean time of the exposure")
             over = f"the image {how} over {self.extent_px:.2g} px during the exposure"
             said.append(Remark(f"{over}: coordinates are those at {when}", Code.BLURRED))
-        if kind.focus:
-            said.append(focus_remark(float(optics.values[0]), float(optics.sigma[0])))
+        for name, value, sigma in zip(kind.lens, optics.values.tolist(), optics.sigma.tolist(), strict=False):
+            said.append(focus_remark(value, sigma) if name == "focus" else _stop_remark(value, sigma))
         return said
 
 
 def focus_remark(by_mm: float, sigma_mm: float) -> Remark:
     """Return what is said of an estimated focus."""
     text = f"the focus was estimated: {by_mm:.4f} ± {sigma_mm:.4f} mm behind the stated image surface"
+    return Remark(text, Code.BLURRED)
+
+
+def _stop_remark(log: float, sigma: float) -> Remark:
+    percent, error = 100 * np.expm1(log), 100 * np.exp(log) * sigma
+    text = f"the stop was estimated: its radius is {percent:+.1f} ± {error:.1f} % from the stated one"
     return Remark(text, Code.BLURRED)
 
 
@@ -263,7 +271,7 @@ class _Compared:
         camera: RayMap,
         targets: Sequence[PlaneTarget],
         options: BlurredOptions,
-        refocused: Callable[[RayMap, float], RayMap] | None,
+        altered: Callable[[RayMap, float, float], RayMap] | None,
         per_line: float,
     ) -> None:
         centres = np.array([target.centre for target in targets])
@@ -272,7 +280,7 @@ class _Compared:
         some = (
             inside[np.unique(np.linspace(0, len(inside) - 1, _MOST).astype(int))] if len(inside) else inside
         )
-        self.frame, self.camera, self.refocused, self.per_line = frame, camera, refocused, per_line
+        self.frame, self.camera, self.altered, self.per_line = frame, camera, altered, per_line
         self.targets, self.centres = [targets[int(k)] for k in some], centres[some]
         self.options = replace(options, varied=None, rings=options.rings or RINGS[0])
         self.basis = self._basis() if len(some) else np.zeros((6, 6))
@@ -295,14 +303,15 @@ class _Compared:
     def view(self, kind: Kind, steps: int, values: Array) -> RayMap:
         """The map of rays with values of the parameters."""
         camera = self.camera
-        if kind.focus:
-            assert self.refocused is not None
-            camera = self.refocused(camera, float(values[0]))
+        if kind.lens:
+            assert self.altered is not None
+            by = dict(zip(kind.lens, values.tolist(), strict=False))
+            camera = self.altered(camera, by.get("focus", 0.0), by.get("stop", 0.0))
         if not kind.way:
             return camera
         amplitudes = np.zeros((2, 6))
         amplitudes[: kind.degree] = (
-            values[int(kind.focus) :].reshape(kind.degree, kind.twists) @ self.basis[:, : kind.twists].T
+            values[len(kind.lens) :].reshape(kind.degree, kind.twists) @ self.basis[:, : kind.twists].T
         )
         middle = (self.frame.height - 1) / 2
         motion = Motion(amplitudes[0], amplitudes[1], kind.way == "vibration", self.per_line, middle)
@@ -321,9 +330,9 @@ class _Compared:
     def fitted(self, kind: Kind, before: Explained | None) -> Explained | None:
         """Estimate the parameters of an explanation, beginning with those of a smaller one."""
         start = self._start(kind, before)
-        names = ("focus_mm",) * kind.focus
-        sigma = (_FOCUS_MM,) * kind.focus + (_PRIOR_PX,) * (kind.parameters - kind.focus)
-        names += tuple(f"motion_{k + 1}_px" for k in range(kind.parameters - kind.focus))
+        motions = kind.parameters - len(kind.lens)
+        names = (*kind.lens, *(f"motion_{k + 1}_px" for k in range(motions)))
+        sigma = (*(_OF_LENS[name] for name in kind.lens), *(_PRIOR_PX,) * motions)
         extent = self._extent(self.view(kind, 2, start))
         while True:
             # Room for a motion that is found to be larger than it is when the estimate begins.
@@ -345,10 +354,10 @@ class _Compared:
         """Approximate values: of those around, the ones whose images correlate best with the photograph."""
         old, values = Kind() if before is None else before.kind, np.zeros(kind.parameters)
         known = np.zeros(0) if before is None else before.optics.values
-        values[: int(kind.focus)] = known[0] if old.focus else 0.0
-        own = values[int(kind.focus) :].reshape(-1, kind.twists) if kind.way else np.zeros((0, 2))
+        values[: len(old.lens)] = known[: len(old.lens)]
+        own = values[len(kind.lens) :].reshape(-1, kind.twists) if kind.way else np.zeros((0, 2))
         if old.way:
-            given = known[int(old.focus) :].reshape(old.degree, old.twists)
+            given = known[len(old.lens) :].reshape(old.degree, old.twists)
             own[: old.degree, : old.twists] = given
         if not kind.way or (old.way and kind.degree == old.degree):
             return values
@@ -397,10 +406,10 @@ def explained(
     targets: Sequence[PlaneTarget],
     options: BlurredOptions | None = None,
     *,
-    refocused: Callable[[RayMap, float], RayMap] | None = None,
+    altered: Callable[[RayMap, float, float], RayMap] | None = None,
     per_line: float = 0.0,
 ) -> Explained | None:
-    """Explain the blur of a frame by motion during the exposure, by focus, or by both.
+    """Explain the blur of a frame by motion during the exposure, by focus, by the stop, or by several.
 
     Parameters
     ----------
@@ -410,8 +419,9 @@ def explained(
     targets : sequence of PlaneTarget (n,)
         In camera axes.
     options : BlurredOptions, optional
-    refocused : callable, optional
-        The lens with its image surface moved by millimetres; without it the focus is not in question.
+    altered : callable, optional
+        The lens with its image surface moved by millimetres, and with the radius of its stop multiplied by
+        the exponential of a number; without it neither is in question.
     per_line : float
         Time between the exposures of adjacent lines, in halves of the exposure.
 
@@ -437,7 +447,7 @@ def explained(
     >>> found.kind.way, round(found.extent_px, 1)
     ('path', 4.1)
     """
-    compared = _Compared(frame, camera, targets, options or BlurredOptions(), refocused, per_line)
+    compared = _Compared(frame, camera, targets, options or BlurredOptions(), altered, per_line)
     if not compared.targets:
         return None
     compared.look()
@@ -445,7 +455,7 @@ def explained(
     while True:
         larger = [
             found
-            for kind in (Kind() if best is None else best.kind).larger(refocused is not None)
+            for kind in (Kind() if best is None else best.kind).larger(altered is not None)
             if (found := compared.fitted(kind, best)) is not None
         ]
         if best is None:
@@ -468,7 +478,7 @@ def measure_explained(
     targets: Sequence[PlaneTarget],
     options: BlurredOptions,
     *,
-    refocused: Callable[[RayMap, float], RayMap] | None = None,
+    altered: Callable[[RayMap, float, float], RayMap] | None = None,
     per_line: float = 0.0,
 ) -> tuple[BlurredResult, Explained | None]:
     """Measure blurred targets; where the lens alone does not explain their images, with what does.
@@ -477,7 +487,7 @@ def measure_explained(
     ----------
     frame, camera, ids, targets, options
         See :func:`reseau.measure.blurred.measure_blurred`.
-    refocused, per_line
+    altered, per_line
         See :func:`explained`.
 
     Returns
@@ -494,7 +504,7 @@ def measure_explained(
     # A stand-in does not know the form of an image: what it leaves says nothing about a motion.
     if like or camera.unknown > 0 or options.varied is not None:
         return found, None
-    reason = explained(frame, camera, targets, options, refocused=refocused, per_line=per_line)
+    reason = explained(frame, camera, targets, options, altered=altered, per_line=per_line)
     if reason is None:
         return found, None
     return reason.told(measure_blurred(frame, reason.optics.camera, ids, targets, options)), reason

@@ -73,7 +73,7 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     >>> alike = 3 * uniform_filter(rng.standard_normal(window.shape), (0, 3, 3))
     >>> cov, influence = np.tile(np.eye(2), (30, 1, 1)), np.stack([window, window], axis=1) / 17
     >>> found = Matches(np.zeros((30, 2)), cov, one, one, one, one, none, one, one, one, 0 * one, one > 0,
-    ...                 alike, none, np.zeros((30, 2, 0)), influence, 0 * window)
+    ...                 alike, none, np.zeros((30, 2, 0)), influence, 0 * window, one)
     >>> bool(with_alike_errors(found).cov[0, 0, 0] > 5)
     True
     """

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...adjust.batch import BatchAdjustment
 from ...core.data import Array, Mask, Rows
-from .patches import CONTRAST, LEVEL, Patches
+from .patches import CONTRAST, LEVEL, WIDTH, Patches
 
 Columns = TypeVar("Columns", "Matches", BatchAdjustment)
 
@@ -55,6 +55,8 @@ class Matches:
         Change of the position with the grey value of each pixel; (k, 2, 0, 0) if it was not wanted.
     leverage : ndarray (k, rows, columns)
         Share of the error of each pixel that the adjustment takes from its residual; empty as `influence`.
+    psf_log_sigma : ndarray (k,)
+        Standard deviations of the logarithms of `psf_px`.
 
     Examples
     --------
@@ -63,7 +65,7 @@ class Matches:
     >>> seen = np.array([1.0, 0.4])
     >>> marks = Matches(xy, cov, one, 0.6 * one, 200 * one, 300 * one, none, one, one, seen, 0 * one,
     ...                 one > 0, np.zeros((2, 17, 17)), none, np.zeros((2, 2, 0)), np.zeros((2, 2, 17, 17)),
-    ...                 np.zeros((2, 17, 17)))
+    ...                 np.zeros((2, 17, 17)), 0.1 * one)
     >>> len(marks.select(marks.seen > 0.5))
     1
     """
@@ -85,6 +87,7 @@ class Matches:
     form_cofactor: Array
     influence: Array
     leverage: Array
+    psf_log_sigma: Array
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -143,10 +146,11 @@ def matches_of(
         influence, leverage = influences
     elif patch.options.influence:
         influence, leverage = patch.influence(x, found.cofactor, used, scale, np.arange(k))
+    width = patch.width(x, np.arange(k))
     return Matches(
         xy=patch.xy + x[:, :2],
         cov=cov[:, :2, :2],
-        psf_px=patch.width(x, np.arange(k)),
+        psf_px=width,
         contrast=x[:, CONTRAST],
         level=x[:, LEVEL],
         t=np.nan_to_num(t),
@@ -161,4 +165,5 @@ def matches_of(
         form_cofactor=found.cofactor[:, :2, patch.form_at :],
         influence=influence,
         leverage=leverage,
+        psf_log_sigma=np.sqrt(cov[:, WIDTH, WIDTH]) * (np.exp(x[:, WIDTH]) / width) ** 2,
     )
