@@ -181,17 +181,24 @@ def _run(job: ScanJob, before: ScanOutcome | None = None) -> ScanOutcome:
     """Orient the frames of one image and write the results, in a worker process."""
     try:
         scan = open_scan(job.image)
-        if not job.rolls or before is None:
+        if before is None:
             results = orient_scan(scan, _options(job))
         else:
             results = reorient_scan(scan, job.rolls, before.results, _options(job))
+            if results == before.results:
+                return before
         calibrated: FrameCorners | None = FrameCorners.read(job.corners) if job.corners else None
         documents = [
             _required(orientation_of(result, calibrated, job.transform), job.image) for result in results
         ]
-        curves = curves_of_scan(scan, results)
+        curves = curves_of_scan(scan, results) if before is None else before.curves
         if job.out is not None:
-            _write(job, scan, documents, curves)
+            # A later run decides by the same results as this one about the curve, and the shapes of rolls.
+            content: dict[str, Any] = {"frames": len(documents)}
+            content["curves"] = None if curves is None else curves.to_dict()
+            if before is not None:
+                content["alone"] = [result.document().to_dict() for result in before.results]
+            _write(job, scan, documents, content)
         if job.overlay is not None:
             scan_overlay(job.overlay, scan, results)
     except ReseauError as error:
@@ -200,7 +207,7 @@ def _run(job: ScanJob, before: ScanOutcome | None = None) -> ScanOutcome:
     return ScanOutcome(documents, results, notes=notes, curves=curves)
 
 
-def _write(job: ScanJob, scan: Any, documents: list[FrameOrientation], curves: CurveEvidence | None) -> None:
+def _write(job: ScanJob, scan: Any, documents: list[FrameOrientation], content: dict[str, Any]) -> None:
     """Write JSON, CSV, picture and marked copy; write the provenance last: it marks the image as done."""
     assert job.out is not None
     for i, document in enumerate(documents):
@@ -214,11 +221,7 @@ def _write(job: ScanJob, scan: Any, documents: list[FrameOrientation], curves: C
         corners = [d.image_points().xy for d in documents if d.corners is not None]
         if corners:
             write_marked(job.out / f"{job.name}-marked.tif", scan, corners)
-    # Scans of a later run are decided together with this one.
-    content = _provenance(job) | {"frames": len(documents)}
-    if curves is not None:
-        content["curves"] = curves.to_dict()
-    write_whole(job.out / "provenance" / f"{job.name}.json", canonical_json(content))
+    write_whole(job.out / "provenance" / f"{job.name}.json", canonical_json(_provenance(job) | content))
 
 
 def _provenance(job: ScanJob) -> dict[str, Any]:
@@ -237,14 +240,14 @@ def _earlier(job: ScanJob) -> ScanOutcome | None:
     try:
         content = json.loads(path.read_text("utf-8"))
         count = content.pop("frames")
-        shown = content.pop("curves", None)
+        shown, alone = content.pop("curves", None), content.pop("alone", None)
         if json.loads(json.dumps(_provenance(job))) != content:
             return None
         stems = [job.name] if count == 1 else [f"{job.name}-{i + 1}" for i in range(count)]
         documents = [FrameOrientation.read(job.out / f"{stem}.json") for stem in stems]
+        before = [FrameOrientation.from_content(each, where=path) for each in alone or ()] or documents
         curves = None if shown is None else CurveEvidence.from_dict(shown)
-        results = [result_of(document) for document in documents]
-        return ScanOutcome(documents, results, curves=curves, kept=True)
+        return ScanOutcome(documents, [result_of(each) for each in before], curves=curves, kept=True)
     except (OSError, ValueError, KeyError, AttributeError, ReseauError):
         return None
 
