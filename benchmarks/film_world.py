@@ -1,9 +1,10 @@
 """Corners of film frames in scans drawn by the way of the light, compared with their truth.
 
 Run from the checkout: ``python benchmarks/film_world.py [--frames 4] [--strips 0] [--first 0] [--jobs 2]
-[--only KIND …] [--each]``.
+[--only KIND …] [--rolls] [--each]``.
 The scans are those of ``benchmarks/worlds/film.py``, which shares nothing with the project; their resolution
 and format are given, and the curve of their grey values as a file states it, except for those of `UNSTATED`.
+With `--rolls` no file states a curve, and the frames of a kind are a roll, which decides about it once.
 For each kind: frames drawn, oriented, answered with three edges, wrong by more than 0.5 px and 5 sigma; of
 those that are oriented rms and largest of the errors of corners, the same over sigmas, and the mean outwards.
 """
@@ -24,7 +25,11 @@ from worlds.film import KINDS, World, frame, strip
 
 from reseau.core.data import Array
 from reseau.core.tone import ToneCurve
+from reseau.execution import Executor
 from reseau.io.scans import scan_of
+from reseau.measure.film.orientation import curves_of_scan
+from reseau.measure.film.roll import curves_of_roll
+from reseau.measure.film.steps import CurveEvidence
 from reseau.procedures.film_frame import FrameOptions, FrameResult, orient_scan
 
 UNSTATED = ("unstated curve", "negative, density")
@@ -78,20 +83,32 @@ def _curve(kind: str, world: World) -> ToneCurve | None:
     return ToneCurve(None if world.code == "srgb" else world.gamma)
 
 
-def one(job: tuple[str, int]) -> Row:
-    """Draw and orient one frame."""
-    kind, seed = job
+def one(job: tuple[str, int, bool, Array | None]) -> tuple[Row, CurveEvidence | None]:
+    """Draw and orient one frame; with or without the curve stated, and with that of its roll."""
+    kind, seed, stated, share = job
     drawn = frame(KINDS[kind], 1000 * list(KINDS).index(kind) + seed)
     scan = scan_of(drawn.pixels, dpi=25.4 * drawn.px_per_mm)
-    scan = replace(scan, curve=_curve(kind, KINDS[kind]))
-    results = orient_scan(scan, FrameOptions(formats=(drawn.format_mm,)))
+    scan = replace(scan, curve=_curve(kind, KINDS[kind]) if stated else None)
+    results = orient_scan(scan, FrameOptions(formats=(drawn.format_mm,), curves=share))
+    curves = curves_of_scan(scan, results)
     found = [_compared(result, drawn.corners) for result in results if result.lines is not None and result]
     nothing = np.full((4, 2), np.nan)
     if not found:
-        return Row(kind, seed, results[0].status, results[0].why, nothing, nothing)
+        return Row(kind, seed, results[0].status, results[0].why, nothing, nothing), curves
     # Of the frames of a strip, the one in its middle.
     status, why, error, sigma = min(found, key=lambda each: float(np.abs(each[2]).max()))
-    return Row(kind, seed, status, why, error, sigma)
+    return Row(kind, seed, status, why, error, sigma), curves
+
+
+def of_kind(executor: Executor, kind: str, seeds: range, rolls: bool) -> list[Row]:
+    """Draw and orient frames of a kind, alone or as a roll."""
+    found = list(outcomes(executor, one, ((kind, seed, not rolls, None) for seed in seeds)))
+    if rolls:
+        curves = curves_of_roll(own for _, own in found)
+        shares = (None if curve is None else curve.share for curve in curves)
+        jobs = ((kind, seed, False, share) for seed, share in zip(seeds, shares, strict=True))
+        found = list(outcomes(executor, one, jobs))
+    return [row for row, _ in found]
 
 
 def _compared(result: FrameResult, truth: Array) -> tuple[str, str, Array, Array]:
@@ -120,6 +137,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="seed of the first")
     add_options(parser)
     parser.add_argument("--only", nargs="*", default=[], help="parts of names of kinds")
+    parser.add_argument("--rolls", action="store_true", help="frames of a kind are a roll without a curve")
     parser.add_argument("--each", action="store_true", help="print every frame that is not oriented, and why")
     given = parser.parse_args()
     kinds = [kind for kind in KINDS if not given.only or any(part in kind for part in given.only)]
@@ -127,7 +145,8 @@ def main() -> int:
     every: list[Row] = []
     with executor_of(given) as executor:
         for kind in kinds:
-            rows = list(outcomes(executor, one, ((kind, given.first + k) for k in range(given.frames))))
+            seeds = range(given.first, given.first + given.frames)
+            rows = of_kind(executor, kind, seeds, given.rolls)
             _print(kind, rows)
             for row in rows:
                 if row.wrong or (given.each and row.status != "oriented"):

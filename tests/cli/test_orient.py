@@ -12,7 +12,7 @@ import tifffile
 
 from reseau.io import FrameCorners, FrameOrientation
 from reseau.io.frame import RollSummary
-from reseau_sims.filmframe import FilmFrame
+from reseau_sims.filmframe import Beside, FilmFrame
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -84,6 +84,18 @@ def test_a_second_run_continues_where_the_first_ended(roll: Path, tmp_path: Path
     # Other options are another result.
     reseau("orient", images[0], "--out", tmp_path, "--jobs", 1, "--no-marked", "--format-mm", "36.1x24")
     assert (tmp_path / "0.json").stat().st_mtime_ns > written
+
+
+@pytest.mark.slow
+def test_a_second_run_decides_by_what_the_first_one_found_without_the_roll(
+    roll: Path, tmp_path: Path, reseau: Run
+) -> None:
+    scan(tmp_path / "doubtful.tif", FilmFrame(320023, dpi=300, beside=Beside(lines=2)))
+    arguments = (roll, tmp_path / "doubtful.tif", "--format-mm", "36x24", "--out", tmp_path, "--jobs", 1)
+    first, document = reseau("orient", *arguments), (tmp_path / "doubtful.json").read_bytes()
+    assert "4 oriented, 1 oriented with the help of the roll, 1 with three edges" in first[1]
+    assert reseau("orient", *arguments) == first
+    assert (tmp_path / "doubtful.json").read_bytes() == document
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from reseau.measure.film.lines import (
     robust_line,
 )
 from reseau.measure.film.orientation import FrameOptions, FrameResult
-from reseau.measure.film.roll import corner_files, rolls_of
+from reseau.measure.film.roll import corner_files, curves_of_roll, rolls_of
 from reseau.procedures.film_frame import reorient_scan
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 
@@ -210,6 +210,14 @@ def test_each_format_in_a_folder_makes_a_roll_of_its_own() -> None:
     assert [(each.format_mm, each.frames) for each in found] == [((56.0, 56.0), 7), ((56.0, 41.5), 4)]
     assert list(corner_files(found)) == ["corners-56x56.json", "corners-56x41.5.json"]
     assert list(corner_files(found[:1])) == ["corners.json"]
+
+
+@pytest.mark.slow
+def test_scans_of_a_roll_decide_together_about_a_curve_that_none_of_them_shows_for_sure() -> None:
+    alone = [oriented(FilmFrame(seed, dpi=300, srgb=True)).curves for seed in (0, 2, 4)]
+    together = curves_of_roll(alone)
+    assert min(each.share[1] for each in together if each) > max(each.share[1] for each in alone if each)
+    assert min(each.share[1] for each in together if each) > 0.95
 
 
 @pytest.mark.slow

@@ -124,7 +124,7 @@ def _line(document: FrameOrientation) -> str:
             for each in document.formats
         )
         text += f", format {' or '.join(sizes)}"
-    return text + (f" ({document.why})" if document.why else "") + "\n"
+    return text + (f" ({document.said})" if document.said else "") + "\n"
 
 
 def fiducials(

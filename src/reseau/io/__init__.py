@@ -19,6 +19,7 @@ from .fiducials import (
 from .frame import (
     CORNERS,
     EDGES,
+    CurveCandidate,
     FormatCandidate,
     FrameCorners,
     FrameOrientation,
@@ -37,6 +38,7 @@ __all__ = [
     "EDGES",
     "SHAPES",
     "BoardDesign",
+    "CurveCandidate",
     "DesignPoint",
     "Document",
     "FiducialDesign",

@@ -116,6 +116,25 @@ class FormatCandidate(Strict):
     probability: float
 
 
+class CurveCandidate(Strict):
+    """A curve that grey values can have, its probability, and how far inwards it puts the edges (px).
+
+    Inwards of their mean over all curves. It is decided by the edges of all frames of a roll.
+
+    Examples
+    --------
+    >>> str(CurveCandidate(what="those of sRGB", probability=0.93, moved_px=0.02))
+    'those of sRGB (probability 0.93)'
+    """
+
+    what: str
+    probability: float
+    moved_px: float
+
+    def __str__(self) -> str:
+        return f"{self.what} (probability {self.probability:.2f})"
+
+
 class RivalEdge(Strict):
     """Second best explanation of what is seen at an edge: its probability, and what it moves inwards (px).
 
@@ -173,7 +192,8 @@ class FrameOrientation(Document):
     The numbers of a declined frame are null. `angle_deg` is the direction of the photo x-axis, which
     runs along the lower edge, against the rows of the scan, positive counter-clockwise as seen.
     `roll_frames` is the number of frames of a roll whose shape was used; `frame` the number of the frame in a
-    scan of several, in reading order; `formats` are those that it can be, if none was given.
+    scan of several, in reading order; `formats` are those that it can be, if none was given; `curves` those
+    that its grey values can have, if the file states none and they are not proportional to the light.
 
     Examples
     --------
@@ -201,6 +221,13 @@ class FrameOrientation(Document):
     roll_frames: int | None = None
     frame: int | None = None
     formats: tuple[FormatCandidate, ...] = ()
+    curves: tuple[CurveCandidate, ...] = ()
+
+    @property
+    def said(self) -> str:
+        """What was wrong, and what grey values are taken as."""
+        grey = f"grey values are taken as {' or '.join(map(str, self.curves))}" if self.curves else ""
+        return "; ".join(part for part in (self.why, grey) if part)
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -223,7 +250,9 @@ class FrameOrientation(Document):
         for edge in content["edges"].values():
             if edge["rival"] is None:
                 del edge["rival"]
-        missing = [key for key in ("transform", "roll_frames", "frame", "formats") if not content[key]]
+        missing = [
+            key for key in ("transform", "roll_frames", "frame", "formats", "curves") if not content[key]
+        ]
         return {key: value for key, value in content.items() if key not in missing}
 
 
@@ -250,8 +279,8 @@ class FrameOutcome(Strict):
         """Create the outcome of a frame with an orientation, or of a declined one."""
         largest = max((max(c.sx, c.sy) for c in (found.corners or {}).values()), default=None)
         return cls(
-            image=found.image, name=name, status=found.status, why=found.why, by_roll=bool(found.roll_frames),
-            sigma_px=largest,
+            image=found.image, name=name, status=found.status, why=found.said, sigma_px=largest,
+            by_roll=bool(found.roll_frames),
         )  # fmt: skip
 
 

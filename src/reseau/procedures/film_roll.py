@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any, Protocol, TypeVar
 
@@ -15,7 +15,9 @@ from ..core.provenance import Provenance
 from ..io import FrameCorners, FrameOrientation
 from ..io.frame import FrameOutcome, RollSummary
 from ..io.scans import Scan
-from ..measure.film.roll import Kind, Roll, corner_files, rolls_of
+from ..measure.film.orientation import curves_of_scan
+from ..measure.film.roll import Kind, Roll, corner_files, curves_of_roll, rolls_of
+from ..measure.film.steps import CurveEvidence
 from .film_frame import FrameOptions, FrameResult, orient_scan, orientation_of, reorient_scan
 
 
@@ -80,6 +82,7 @@ class FilmRollProcedure:
         self._options, self._calibrated, self._kind = options, calibrated, kind
         self._parameters, self._inputs = dict(parameters or {}), dict(inputs or {})
         self._results: dict[str, list[FrameResult]] = {}
+        self._curves: dict[str, CurveEvidence | None] = {}
         self._rolls: tuple[Roll, ...] = ()
         self.frames: tuple[OrientedFrame, ...] = ()
 
@@ -90,7 +93,9 @@ class FilmRollProcedure:
 
     def on_frame(self, frame: Frame, step: _Named) -> Verdict:
         """Orient the frames of a scan; a declined one may be oriented when the roll is known."""
-        self._results[step.name] = orient_scan(self.opened(step.name), self._options)
+        scan = self.opened(step.name)
+        self._results[step.name] = orient_scan(scan, self._options)
+        self._curves[step.name] = curves_of_scan(scan, self._results[step.name])
         self._inputs[step.name] = frame.sha256
         return Verdict(True)
 
@@ -123,11 +128,18 @@ class FilmRollProcedure:
         EstimationError
             If no frame could be oriented, or a transformation is not determined.
         """
+        options: dict[str, FrameOptions] = {}
+        for (name, own), curve in zip(
+            self._curves.items(), curves_of_roll(self._curves.values()), strict=True
+        ):
+            options[name] = replace(self._options, curves=None if curve is None else curve.share)
+            if curve is not None and not curve.like(own):
+                self._results[name] = orient_scan(self.opened(name), options[name])
         self._rolls = rolls_of([each for results in self._results.values() for each in results])
         frames, stems = [], _stems(list(self._results))
         for name, results in self._results.items():
             if self._rolls and any(each.status != "oriented" for each in results):
-                results = reorient_scan(self.opened(name), self._rolls, results, self._options)
+                results = reorient_scan(self.opened(name), self._rolls, results, options[name])
             for k, each in enumerate(results, start=1):
                 found = orientation_of(each, self._calibrated, self._kind)
                 if isinstance(found, Failure):

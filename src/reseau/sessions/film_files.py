@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..archive.objects import objects_at
 from ..core import vocabulary as v
+from ..core.data import Array
 from ..core.errors import EstimationError, ReseauError, UsageError
 from ..core.failure import Failure
 from ..core.files import made_folder, readable
@@ -24,7 +25,9 @@ from ..execution import Executor
 from ..io import FrameCorners, FrameOrientation, write_whole
 from ..io.frame import FrameOutcome, RollSummary
 from ..io.images import open_scan, write_image
-from ..measure.film.roll import Roll, corner_files, result_of, rolls_of
+from ..measure.film.orientation import curves_of_scan
+from ..measure.film.roll import Roll, corner_files, curves_of_roll, result_of, rolls_of
+from ..measure.film.steps import CurveEvidence
 from ..procedures.film_frame import FrameOptions, FrameResult, orient_scan, orientation_of, reorient_scan
 from ..report.frames import contact_sheet, frame_tile, roll_page, scan_overlay, write_cut, write_marked
 
@@ -45,15 +48,19 @@ class ScanJob:
     cut: bool = False
     overlay: v.Overlay | None = None
     rolls: tuple[Roll, ...] = ()
+    curves: Array | None = None
 
 
 @dataclass(frozen=True)
 class ScanOutcome:
-    """Result of one scan; files that another machine has made, by their SHA-256 in the store."""
+    """Result of one scan, and what it shows of its curve; whether it is that of an earlier run; files that
+    another machine has made, by their SHA-256 in the store."""
 
     documents: list[FrameOrientation]
     results: list[FrameResult]
     failed: str = ""
+    curves: CurveEvidence | None = None
+    kept: bool = False
     notes: tuple[str, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
 
@@ -124,6 +131,8 @@ def orient_files(
     if not executor.local and any(job.overlay for job in jobs):
         raise UsageError("is drawn by this machine only", where="--overlay", do="leave out --cluster")
     done = dict(zip((job.name for job in jobs), _all(jobs, executor, store, step), strict=True))
+    if roll:
+        jobs = _of_one_curve(jobs, done, executor, store)
     found = rolls_of([result for item in done.values() for result in item.results]) if roll else ()
     if found:
         _again(jobs, done, found)
@@ -164,32 +173,41 @@ def _options(job: ScanJob) -> FrameOptions:
     if job.near is not None:
         x0, y0, x1, y1 = job.near
         near = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-    common = FrameOptions(dpi=job.dpi, near=near)
-    return common if size is None else FrameOptions(formats=(size,), dpi=job.dpi, near=near)
+    common = FrameOptions(dpi=job.dpi, near=near, curves=job.curves)
+    return common if size is None else replace(common, formats=(size,))
 
 
 def _run(job: ScanJob, before: ScanOutcome | None = None) -> ScanOutcome:
     """Orient the frames of one image and write the results, in a worker process."""
     try:
         scan = open_scan(job.image)
-        if not job.rolls or before is None:
+        if before is None:
             results = orient_scan(scan, _options(job))
         else:
             results = reorient_scan(scan, job.rolls, before.results, _options(job))
+            if results == before.results:
+                return before
         calibrated: FrameCorners | None = FrameCorners.read(job.corners) if job.corners else None
         documents = [
             _required(orientation_of(result, calibrated, job.transform), job.image) for result in results
         ]
+        curves = curves_of_scan(scan, results) if before is None else before.curves
         if job.out is not None:
-            _write(job, scan, documents)
+            # A later run decides by the same results as this one about the curve, and the shapes of rolls.
+            content: dict[str, Any] = {"frames": len(documents)}
+            content["curves"] = None if curves is None else curves.to_dict()
+            if before is not None:
+                content["alone"] = [result.document().to_dict() for result in before.results]
+            _write(job, scan, documents, content)
         if job.overlay is not None:
             scan_overlay(job.overlay, scan, results)
     except ReseauError as error:
         return ScanOutcome([], [], str(error))
-    return ScanOutcome(documents, results, notes=tuple(f"{job.image.name}: {note}" for note in scan.notes))
+    notes = tuple(f"{job.image.name}: {note}" for note in scan.notes)
+    return ScanOutcome(documents, results, notes=notes, curves=curves)
 
 
-def _write(job: ScanJob, scan: Any, documents: list[FrameOrientation]) -> None:
+def _write(job: ScanJob, scan: Any, documents: list[FrameOrientation], content: dict[str, Any]) -> None:
     """Write JSON, CSV, picture and marked copy; write the provenance last: it marks the image as done."""
     assert job.out is not None
     for i, document in enumerate(documents):
@@ -203,8 +221,7 @@ def _write(job: ScanJob, scan: Any, documents: list[FrameOrientation]) -> None:
         corners = [d.image_points().xy for d in documents if d.corners is not None]
         if corners:
             write_marked(job.out / f"{job.name}-marked.tif", scan, corners)
-    content = _provenance(job) | {"frames": len(documents)}
-    write_whole(job.out / "provenance" / f"{job.name}.json", canonical_json(content))
+    write_whole(job.out / "provenance" / f"{job.name}.json", canonical_json(_provenance(job) | content))
 
 
 def _provenance(job: ScanJob) -> dict[str, Any]:
@@ -223,11 +240,14 @@ def _earlier(job: ScanJob) -> ScanOutcome | None:
     try:
         content = json.loads(path.read_text("utf-8"))
         count = content.pop("frames")
+        shown, alone = content.pop("curves", None), content.pop("alone", None)
         if json.loads(json.dumps(_provenance(job))) != content:
             return None
         stems = [job.name] if count == 1 else [f"{job.name}-{i + 1}" for i in range(count)]
         documents = [FrameOrientation.read(job.out / f"{stem}.json") for stem in stems]
-        return ScanOutcome(documents, [result_of(document) for document in documents])
+        before = [FrameOrientation.from_content(each, where=path) for each in alone or ()] or documents
+        curves = None if shown is None else CurveEvidence.from_dict(shown)
+        return ScanOutcome(documents, [result_of(each) for each in before], curves=curves, kept=True)
     except (OSError, ValueError, KeyError, AttributeError, ReseauError):
         return None
 
@@ -235,22 +255,44 @@ def _earlier(job: ScanJob) -> ScanOutcome | None:
 def _all(
     work: list[ScanJob], executor: Executor, store: str, step: Callable[[], None]
 ) -> Iterator[ScanOutcome]:
-    """Orient all images in parallel; yield the results in their order."""
+    """Orient all images that no earlier run has oriented, in parallel; yield the results in their order."""
     kept = [_earlier(job) for job in work]
-    rest = [job for job, done in zip(work, kept, strict=True) if done is None]
-    if executor.local:
-        fresh = executor.outcomes(_run, ((job.name, job) for job in rest))
-    else:
-        fresh = executor.outcomes(partial(_run_apart, store), ((job.name, _sent(job, store)) for job in rest))
-    for job, done in zip(work, kept, strict=True):
-        if done is None:
-            _, found = next(fresh)
-            if isinstance(found, Failure):
-                found = ScanOutcome([], [], f"{job.image}: {found.reason}")
-            done = found
-            _receive(job, done, store)
+    fresh = _fresh([job for job, done in zip(work, kept, strict=True) if done is None], executor, store)
+    for earlier in kept:
+        done = next(fresh) if earlier is None else earlier
         step()
         yield done
+
+
+def _fresh(work: list[ScanJob], executor: Executor, store: str) -> Iterator[ScanOutcome]:
+    """Orient images in parallel; yield the results in their order."""
+    if executor.local:
+        found = executor.outcomes(_run, ((job.name, job) for job in work))
+    else:
+        found = executor.outcomes(partial(_run_apart, store), ((job.name, _sent(job, store)) for job in work))
+    for job, (_, done) in zip(work, found, strict=True):
+        if isinstance(done, Failure):
+            done = ScanOutcome([], [], f"{job.image}: {done.reason}")
+        _receive(job, done, store)
+        yield done
+
+
+def _of_one_curve(
+    work: list[ScanJob], done: dict[str, ScanOutcome], executor: Executor, store: str
+) -> list[ScanJob]:
+    """The jobs with the curve of the grey values that all scans of the roll show together.
+
+    What is not sure by the scans alone is oriented again with it; what an earlier run has decided stays.
+    """
+    own = [done[job.name] for job in work]
+    jobs, again = [], []
+    for job, item, curve in zip(work, own, curves_of_roll(item.curves for item in own), strict=True):
+        used = item.curves if item.kept else curve
+        jobs.append(replace(job, curves=None if used is None else used.share))
+        if used is not None and not used.like(item.curves):
+            again.append(jobs[-1])
+    done.update(zip((job.name for job in again), _fresh(again, executor, store), strict=True))
+    return jobs
 
 
 def _sent(job: ScanJob, store: str) -> tuple[ScanJob, dict[str, str]]:

@@ -21,7 +21,7 @@ from .adjacent_lines import (
 from .border import Band, Border, Film
 from .edges import EdgeProfiles, measure_profiles, merged
 from .lines import Contender, EdgeData, Rival, departing_line, robust_line
-from .steps import Curve, Developed, StepForm, Tone
+from .steps import CurveEvidence, Developed, StepForm, Tone, probabilities_of
 
 _NEIGHBOURHOOD_PX = 0.05
 """Minimum contribution of an uneven gate and of picture content to the sigma of a profile."""
@@ -67,8 +67,7 @@ class Channel:
     """Measured edges of one channel: profiles kept, number rejected, reason for a missing edge.
 
     Also the number of the channel, the polarity of the film, film and picture beside each edge, the width of
-    a step, and the curve of the grey values if the file does not state it: the one taken, unless they are
-    proportional to the light, and the one that could displace all edges most.
+    a step, and what the edges show of the curve of the grey values if the file does not state it.
     """
 
     name: str
@@ -79,11 +78,10 @@ class Channel:
     data: list[EdgeData | None]
     rejected: list[int]
     why: list[str]
-    curve: str = ""
-    other: Rival | None = None
+    curves: CurveEvidence | None = None
 
     @property
-    def curves(self) -> Array:
+    def shown(self) -> Array:
         """What each edge shows of the curves (e, k, 2); see :class:`EdgeData`."""
         return np.array([each.curves for each in self.data if each is not None])
 
@@ -137,33 +135,40 @@ def measure_channel(
     polarity: int,
     reach: float,
     gap: float,
-    curves: Sequence[Curve],
+    forms: Sequence[Tone | Developed],
+    share: Array | None = None,
 ) -> Channel:
     """Profiles of the four edges in one channel that agree with a line through each edge.
 
-    Of several `curves` that the grey values may have, that is taken with which the edges are straight: the
-    displacement of steps by another one depends on their contrast.
+    Of several curves that the grey values may have, that is taken with which the edges are straight: the
+    displacement of steps by another one depends on their contrast. Unless the probabilities `share` (k,) of
+    the curves are known by other frames, too.
     """
-    forms = [each.form for each in curves]
-    prior = np.log([each.prior for each in curves])
-    tried = [_measured(name, band, channel, polarity, reach, gap, forms, 0)]
-    if not any(tried[0].data):
-        return tried[0]
-    if np.argmax(log := prior + tried[0].curves.sum(axis=0)[:, 0]):
+    tones = np.array([isinstance(form, Tone) for form in forms])
+
+    def measured(taken: int) -> Channel:
+        return _measured(name, band, channel, polarity, reach, gap, forms, taken)
+
+    found = measured(0)
+    if len(forms) == 1 or not any(found.data):
+        return found
+    tried = {0: found}
+    log = found.shown.sum(axis=0)[:, 0]
+    own = probabilities_of(log)
+    if np.argmax(own) and any((second := measured(taken := 1 + int(np.argmax((own * tones)[1:])))).data):
         # What a curve does to a step is computed for the measured one: neither of two curves is favoured.
-        tones = np.array([k > 0 and isinstance(form, Tone) for k, form in enumerate(forms)])
-        second = int(np.argmax(np.where(tones, log, -np.inf)))
-        tried.append(_measured(name, band, channel, polarity, reach, gap, forms, second))
-    log = prior + np.mean([each.curves.sum(axis=0)[:, 0] for each in tried if any(each.data)], axis=0)
-    share = scipy.special.softmax(log)
+        tried[taken] = second
+        log = (log + second.shown.sum(axis=0)[:, 0]) / 2
+        own = probabilities_of(log)
+    share = own if share is None else share
     best = int(np.argmax(share))
     # A blur on the film is one of the light for the scanner.
-    found = tried[-1 if best and isinstance(forms[best], Tone) else 0]
-    data = [own and own.curved(share) for own in found.data]
-    moved = found.curves[..., 1].mean(axis=0) - share @ found.curves[..., 1].mean(axis=0)
-    other = int(np.argmax(np.where(np.arange(len(share)) == best, 0.0, share) * moved**2))
-    rival = Rival(curves[other].name, float(share[other]), float(moved[other]))
-    return replace(found, data=data, curve=curves[best].name if best else "", other=rival)
+    if tones[best]:
+        found = tried[best] if best in tried else measured(best)
+    found = found if any(found.data) else tried[0]
+    moves = found.shown[..., 1].mean(axis=0)
+    data = [edge and edge.curved(share) for edge in found.data]
+    return replace(found, data=data, curves=CurveEvidence(log, share, moves - share @ moves))
 
 
 def _measured(

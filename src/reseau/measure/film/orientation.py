@@ -3,6 +3,7 @@ reason."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -15,14 +16,23 @@ from ...core.data import Array, Frame
 from ...core.display import Display
 from ...core.failure import Code, Failure
 from ...core.overlaid import Overlaid
-from ...io import CORNERS, EDGES, FormatCandidate, FrameOrientation, MeasuredCorner, MeasuredEdge, RivalEdge
+from ...io import (
+    CORNERS,
+    EDGES,
+    CurveCandidate,
+    FormatCandidate,
+    FrameOrientation,
+    MeasuredCorner,
+    MeasuredEdge,
+    RivalEdge,
+)
 from ...io.scans import Scan
 from .border import Band, read_band
 from .channel import WIDER_SEARCH, Channel, channels_by_contrast, measure_channel
 from .formats import ALL_FORMATS, FORMATS, format_probabilities, scale_by_perforations
 from .lines import EdgeData, FrameShape, Lines, adjust_lines, derived, explained_shape, shape_of
 from .search import FrameGuess, search_frames, size_of
-from .steps import curves_of
+from .steps import CURVES, CurveEvidence, curves_of, decided_together, probabilities_of
 from .strips import in_reading_order, overview_of, rest_of_strip
 
 if TYPE_CHECKING:
@@ -83,6 +93,8 @@ class FrameOptions:
         Largest tilt.
     shape : FrameShape, optional
         Format and shape of the camera's frame from other frames of its roll; replaces the formats.
+    curves : ndarray (k,), optional
+        Probabilities of the curves of grey values that the file does not state, by all frames of its roll.
 
     Examples
     --------
@@ -97,6 +109,7 @@ class FrameOptions:
     angle_sigma_deg: float = 0.25
     max_tilt_deg: float = 16.0
     shape: FrameShape | None = None
+    curves: Array | None = None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -131,6 +144,8 @@ class FrameResult(Display, Overlaid):
         Number of the frame in a scan of several, in reading order.
     formats : tuple of ((float, float), float)
         Formats that the frame can be, with their probabilities, if none was given.
+    curves : CurveEvidence, optional
+        What its edges show of the curve of grey values that the file does not state.
 
     Examples
     --------
@@ -153,6 +168,7 @@ class FrameResult(Display, Overlaid):
     place: Array | None = None
     frame: int | None = None
     formats: tuple[tuple[tuple[float, float], float], ...] = ()
+    curves: CurveEvidence | None = None
 
     def __bool__(self) -> bool:
         return self.status != "declined"
@@ -252,6 +268,7 @@ class FrameResult(Display, Overlaid):
             "roll_frames": self.roll_frames,
             "frame": self.frame,
             "formats": tuple(FormatCandidate(format_mm=each, probability=p) for each, p in self.formats),
+            "curves": _candidates(self.curves),
         }
         if self.lines is None or not self:
             none = dict.fromkeys(
@@ -297,13 +314,15 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
     --------
     A frame of 36 mm × 24 mm, brighter than the film around it, in grey values proportional to the light:
 
+    >>> from reseau.core.tone import ToneCurve
     >>> from reseau.io.scans import scan_of
     >>> from reseau.optics.formation import draw, rectangles
     >>> frame = draw(rectangles(np.array([[19.5, 19.5, 163.5, 115.5]]), 0.5), (136, 184), 1.0)
     >>> grey = 60 + 120 * frame + np.random.default_rng(0).normal(0, 2, frame.shape)
     >>> near = np.array([[20.0, 20.0], [163.0, 20.0], [163.0, 115.0], [20.0, 115.0]])
     >>> options = FrameOptions(formats=((36.0, 24.0),), near=near)
-    >>> (found,) = orient_frames(scan_of(grey.astype(np.float32)), options)
+    >>> scan = replace(scan_of(grey.astype(np.uint8)), curve=ToneCurve(1.0))
+    >>> (found,) = orient_frames(scan, options)
     >>> found.status, bool(abs(found.lines.corners[0] - 19.5).max() < 0.1)
     ('oriented', True)
     """
@@ -320,7 +339,15 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
             guesses, reduction = (guesses, reduction) if isinstance(again, Failure) else (again, finer)
         results = [_oriented(scan, guess, reduction, options, scale) for guess in guesses]
         if any(results):
-            return in_reading_order(rest_of_strip(scan, results, options, _oriented))
+            found = in_reading_order(rest_of_strip(scan, results, options, _oriented))
+            common = curves_of_scan(scan, found)
+            if (
+                options.curves is None
+                and common is not None
+                and not all(common.like(r.curves) for r in found)
+            ):
+                return orient_frames(scan, replace(options, curves=common.share))
+            return found
         # The reason why four edges are no frame is more useful than why three of them are none.
         declined = declined or results[:1]
     return declined
@@ -450,38 +477,68 @@ def _oriented(
     shape = options.shape
     if shape is None or guess.format_mm != (shape.width, shape.height):
         shape = FrameShape(*guess.format_mm, options.aspect_sigma, float(np.deg2rad(options.angle_sigma_deg)))
-    curves = curves_of(scan.curve, scan.full_scale, guess.polarity, whole=scan.dtype.kind != "f")
+    forms = curves_of(scan.curve, _full_scale(scan, band), guess.polarity)
     best: FrameResult | None = None
     earlier: list[Channel] = []
     for c in channels_by_contrast([band(k, False) for k in range(4)], len(scan.channels), reach):
         name = scan.channels[c]
-        measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale, curves)
+        measured = measure_channel(
+            name, band, c, guess.polarity, reach, _GAP_MM * scale, forms, options.curves
+        )
         for other in earlier:
             measured = measured.doubted(other)
         earlier.append(measured)
-        result = _judged(scan, guess, measured, corners, shape, options)
+        result = replace(_judged(scan, guess, measured, corners, shape, options), curves=measured.curves)
         # Channels are ordered by contrast: a later one must show more edges, or more accurate ones.
         if best is None or _seen(result) > _seen(best):
-            best, said = result, _curve(measured, result)
+            best = result
         if best.status == "oriented" and not best.why:
             break  # other channels show the same edges with less contrast
     assert best is not None
-    why = "; ".join([best.why] * bool(best.why) + said)
-    return replace(best, place=corners, formats=tuple(formats), why=why)
+    return replace(best, place=corners, formats=tuple(formats))
 
 
-def _curve(measured: Channel, result: FrameResult) -> list[str]:
-    """What the edges show of the curve of the grey values that the file does not state."""
-    if result.lines is None:
-        return []
-    text = f"grey values, of which the file states no curve, are taken as {measured.curve}"
-    said, other = [text] * bool(measured.curve), measured.other
-    least = _STATED[1] * float(np.sqrt(np.diag(result.lines.covariance)).max())
-    if other is None or other.probability < _STATED[0]:
-        return said
-    if np.sqrt(other.probability) * abs(other.moved_px) > least:
-        said.append(f"all edges: grey values {other}")
-    return said
+def _full_scale(scan: Scan, band: Callable[[int, bool], Band | None]) -> float:
+    """Grey value of full scale: numbers in floating point may be those of 8 or 16 bits."""
+    if scan.dtype.kind != "f":
+        return scan.full_scale
+    seen = (band(k, False) for k in range(4))
+    top = max((float(np.nanmax(each.grey)) for each in seen if each is not None), default=1.0)
+    return next((most for most in (1.0, 255.0, 65535.0) if top < 2 * most), top)
+
+
+def curves_of_scan(scan: Scan, results: Sequence[FrameResult]) -> CurveEvidence | None:
+    """What the frames of a scan together show of the curve of grey values; None if the scan states it.
+
+    Examples
+    --------
+    >>> from reseau.io.scans import scan_of
+    >>> curves_of_scan(scan_of(np.zeros((20, 30), np.uint8)), []).share[:3]
+    array([0.5 , 0.25, 0.1 ])
+    """
+    if scan.curve is not None:
+        return None
+    coding = f"{scan.dtype.name} {' '.join(scan.channels)}"
+    own = [each.curves for each in results if each.curves is not None]
+    if len(own) == 1:
+        return own[0]._replace(coding=coding)
+    log = moved = np.zeros(len(CURVES))
+    if own:
+        log, _ = decided_together(np.array([each.log for each in own]))
+        moved = np.mean([each.moved for each in own], axis=0)
+    return CurveEvidence(log, probabilities_of(log), moved, coding)
+
+
+def _candidates(curves: CurveEvidence | None) -> tuple[CurveCandidate, ...]:
+    """The curves of the grey values that are probable; none if these are only proportional to the light."""
+    if curves is None:
+        return ()
+    order = [int(k) for k in np.argsort(-curves.share, kind="stable") if curves.share[k] > _STATED[0]]
+    return tuple(
+        CurveCandidate(what=CURVES[k][0], probability=float(curves.share[k]), moved_px=float(curves.moved[k]))
+        for k in order
+        if order != [0]
+    )
 
 
 def _seen(result: FrameResult) -> tuple[int, float]:
