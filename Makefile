@@ -4,8 +4,8 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= out
 PIP    := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
-# One more than processors: tests of drivers wait for time-outs.
-WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
+# Two more than processors: tests of drivers wait for time-outs.
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 2)')
 # Bytecode is kept, also where the environment says otherwise: workers, and commands that tests start, share it.
 export PYTHONDONTWRITEBYTECODE :=
 # What Debian's gir1.2-aravis-0.8 brings: GigE Vision and USB3 Vision.
