@@ -24,7 +24,7 @@ from ..exchange.lenses import Lens
 from ..io import ReseauDesign, TestfieldDesign
 from ..measure.blurred import BlurredOptions, estimate_optics, measure_blurred
 from ..measure.blurred.measure import BlurredResult, Varied
-from ..measure.blurred.motion import Explained, Moving, focus_remark, measure_explained
+from ..measure.blurred.motion import Altered, Explained, Moving, focus_remark, measure_explained
 from ..optics import Pose
 from ..optics.formation import mark_outline
 from ..optics.lenses import Paraxial, Prescription, RayMap, ThinLens
@@ -432,6 +432,12 @@ def measure_blurred_frame(
     return _some(_described(_noted(found, [*notes, focus_remark(moved, sigma)] if given else notes)))
 
 
+def alterable(camera: RayMap) -> Altered | None:
+    """:func:`refocused` for a lens of which focus and stop may be others than stated; None for a stand-in."""
+    inner = camera.camera if isinstance(camera, CalibratedLens) else camera
+    return refocused if isinstance(inner, LensCamera) else None
+
+
 def refocused(camera: RayMap, by_mm: float, wider: float = 0.0) -> RayMap:
     """A lens with its image surface moved along the light, and another stop.
 
@@ -647,8 +653,7 @@ class _Frame:
             found = measure_blurred(*job)
             found = found if reason is None else reason.told(found)
         else:
-            inner = camera.camera if isinstance(camera, CalibratedLens) else camera
-            by = refocused if isinstance(inner, LensCamera) and not self.focus_given else None
+            by = None if self.focus_given else alterable(camera)
             found, reason = measure_explained(*job, altered=by, per_line=self.per_line)
             camera = camera if reason is None else reason.optics.camera
         return BlurredFrame(found, pose, tuple(targets), rms_px, camera), reason

@@ -37,7 +37,7 @@ from ..optics.lenses.ray_maps import CalibratedLens, LensCamera
 from ..optics.lenses.windows import behind_windows
 from ..optics.refraction import RefractedRays
 from ..optics.refraction.windows import Refraction
-from .blurred import SPACING_PX
+from .blurred import SPACING_PX, alterable
 
 _NODES = 150
 """Largest number of nodes along the size of a target."""
@@ -377,7 +377,7 @@ class _Again(NamedTuple):
 
 def _measured(job: _Job | _Again) -> tuple[BlurredResult, Explained | None]:
     if isinstance(job, _Job):
-        return measure_explained(*job)
+        return measure_explained(*job, altered=alterable(job.camera))
     job, reason = job
     if reason is None:
         return measure_blurred(*job), None

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -47,6 +47,8 @@ _COARSE = 2
 """Rings of elements of the stop for these."""
 _STEP_RAD, _STEP_MM = 1e-5, 1e-3
 """Steps of twists for their derivatives."""
+Altered: TypeAlias = Callable[[RayMap, float, float], RayMap]
+"""A lens with its image surface moved by millimetres and another stop, see :func:`explained`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,15 +216,18 @@ class Explained:
         With the map of rays that contains it.
     extent_px : float
         Largest way of an image during the exposure.
+    altered : callable, optional
+        See :func:`explained`.
     """
 
     kind: Kind
     optics: EstimatedOptics
     extent_px: float
+    altered: Altered | None = None
 
     def on(self, camera: RayMap) -> RayMap:
-        """Return the map of rays of another estimate of the orientation, with the same motion."""
-        view = self.optics.camera
+        """Return the map of rays of another estimate of the orientation, with the same explanation."""
+        view, camera = self.optics.camera, _altered(camera, self.kind, self.optics.values, self.altered)
         return replace(view, camera=camera) if isinstance(view, Moving) else camera
 
     def told(self, found: BlurredResult) -> BlurredResult:
@@ -250,6 +255,14 @@ def focus_remark(by_mm: float, sigma_mm: float) -> Remark:
     return Remark(text, Code.BLURRED)
 
 
+def _altered(camera: RayMap, kind: Kind, values: Array, by: Altered | None) -> RayMap:
+    """A lens with what it has another of, the first of the values of an explanation."""
+    if not kind.lens or by is None:
+        return camera
+    known = dict(zip(kind.lens, values.tolist(), strict=False))
+    return by(camera, known.get("focus", 0.0), known.get("stop", 0.0))
+
+
 def _stop_remark(log: float, sigma: float) -> Remark:
     percent, error = 100 * np.expm1(log), 100 * np.exp(log) * sigma
     text = f"the stop was estimated: its radius is {percent:+.1f} ± {error:.1f} % from the stated one"
@@ -271,7 +284,7 @@ class _Compared:
         camera: RayMap,
         targets: Sequence[PlaneTarget],
         options: BlurredOptions,
-        altered: Callable[[RayMap, float, float], RayMap] | None,
+        altered: Altered | None,
         per_line: float,
     ) -> None:
         centres = np.array([target.centre for target in targets])
@@ -302,11 +315,7 @@ class _Compared:
 
     def view(self, kind: Kind, steps: int, values: Array) -> RayMap:
         """The map of rays with values of the parameters."""
-        camera = self.camera
-        if kind.lens:
-            assert self.altered is not None
-            by = dict(zip(kind.lens, values.tolist(), strict=False))
-            camera = self.altered(camera, by.get("focus", 0.0), by.get("stop", 0.0))
+        camera = _altered(self.camera, kind, values, self.altered)
         if not kind.way:
             return camera
         amplitudes = np.zeros((2, 6))
@@ -344,7 +353,7 @@ class _Compared:
                 return None
             extent, start = self._extent(found.camera), found.values
             if extent <= room:
-                return Explained(kind, found, extent)
+                return Explained(kind, found, extent, self.altered)
 
     def _extent(self, view: RayMap) -> float:
         """Way of the images, pixels; 0 at rest."""
@@ -406,7 +415,7 @@ def explained(
     targets: Sequence[PlaneTarget],
     options: BlurredOptions | None = None,
     *,
-    altered: Callable[[RayMap, float, float], RayMap] | None = None,
+    altered: Altered | None = None,
     per_line: float = 0.0,
 ) -> Explained | None:
     """Explain the blur of a frame by motion during the exposure, by focus, by the stop, or by several.
@@ -478,7 +487,7 @@ def measure_explained(
     targets: Sequence[PlaneTarget],
     options: BlurredOptions,
     *,
-    altered: Callable[[RayMap, float, float], RayMap] | None = None,
+    altered: Altered | None = None,
     per_line: float = 0.0,
 ) -> tuple[BlurredResult, Explained | None]:
     """Measure blurred targets; where the lens alone does not explain their images, with what does.
