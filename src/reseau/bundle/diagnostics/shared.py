@@ -137,7 +137,7 @@ class SharedErrors:
         What shared errors do to the cameras is corrected in each direction of its own: by the scores of the
         images, which may be larger or smaller than a field of the assumed form makes them.
         """
-        fit, unknowns = self.fit, self.fit.unknowns
+        fit = self.fit
         columns = _camera_columns(fit)
         q = fit.cofactors.reduced.block(columns, columns)
         formal = q * fit.variance
@@ -151,7 +151,7 @@ class SharedErrors:
         inverse = np.linalg.inv(root)
         b, turn = np.linalg.eigh(inverse @ shared @ inverse.T)
         directions, b = root @ turn, np.maximum(b, 0.0)
-        own, relative = self._scaled(columns, directions, b, unknowns.camera, unknowns.count)
+        own, relative = self._scaled(columns, directions, b)
         parts = np.concatenate(
             [self.variance * q[None], target[None], self.variance * own[:, None, None]
              * directions.T[:, :, None] * directions.T[:, None, :]]
@@ -195,10 +195,9 @@ class SharedErrors:
         own = sensitivities(self.fit, effect, columns) * _one_unit(effect, sigma_seen(self.fit))
         return np.asarray(self.variance * self.points**2 * (own @ own.T))
 
-    def _scaled(
-        self, columns: Rows, directions: Array, b: Array, camera: Rows, count: Rows
-    ) -> tuple[Array, Array]:
+    def _scaled(self, columns: Rows, directions: Array, b: Array) -> tuple[Array, Array]:
         """Variances by shared errors in each direction (k,), b where they have the form assumed; spreads."""
+        camera, count = self.fit.unknowns.camera, self.fit.unknowns.count
         width = int(count.max(initial=0))
         groups = len(self.pulls) // max(width, 1)
         if not groups:
