@@ -18,6 +18,7 @@ import numpy as np
 
 from ..bundle import Network, Result, adjust_network
 from ..bundle import Options as BundleOptions
+from ..bundle.diagnostics.checks import listed
 from ..bundle.network.settings import observation_columns
 from ..core import vocabulary as v
 from ..core.data import Array, Frame, Mask, Rows
@@ -28,7 +29,7 @@ from ..core.failure import Code, Failure, Remark
 from ..io.network import Network1
 from ..io.targets import SpaceTargets
 from ..measure.blurred import BlurredOptions, measure_blurred
-from ..measure.blurred.measure import BlurredResult
+from ..measure.blurred.measure import RESIDUALS, BlurredResult
 from ..measure.blurred.motion import Explained, measure_explained
 from ..measure.ordinary import ordinary_coordinates
 from ..optics.lenses import RayMap, ThinLens
@@ -330,21 +331,25 @@ def _misfits(entry: BlurredRound) -> tuple[Remark, ...]:
     The adjustment cannot tell: another lens shifts coordinates smoothly over the image, which distortion and
     object points take up. The matching can, as it compares the form of the images.
     """
-    unlike = {
-        name: found.misfit
-        for name, found in entry.measured.items()
-        if any(note.code == Code.INCONSISTENT for note in found.notes)
-    }
-    if not unlike:
-        return ()
-    names, values = list(unlike), list(unlike.values())
-    more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+    by_residuals, by_widths = list[str](), list[str]()
+    for name, found in entry.measured.items():
+        for note in found.notes:
+            if note.code == Code.INCONSISTENT:
+                (by_residuals if note.text.startswith(RESIDUALS) else by_widths).append(name)
+    said = []
+    if by_residuals:
+        values = [entry.measured[name].misfit for name in by_residuals]
+        said.append(
+            f"residuals of the targets in {listed(by_residuals, 8)} are {min(values):.3g} to "
+            f"{max(values):.3g} times the noise beside them"
+        )
+    if by_widths:
+        said.append(f"what blurs beside the rays differs from target to target in {listed(by_widths, 8)}")
     text = (
-        f"residuals of the targets in {', '.join(names[:8])}{more} are {min(values):.3g} to "
-        f"{max(values):.3g} times the noise beside them: lens, focus or aperture are not theirs, and "
-        "object points may be wrong by more than their sigmas, also where sigma0 is good"
+        "lens, focus or aperture are not theirs, and object points may be wrong by more than their sigmas, "
+        "also where sigma0 is good"
     )
-    return (Remark(text, Code.INCONSISTENT),)
+    return tuple(Remark(f"{each}: {text}", Code.INCONSISTENT) for each in said)
 
 
 def _far(uv: Array) -> Array:
@@ -629,15 +634,14 @@ class _Run:
         if last.declined.any():
             rows = np.flatnonzero(last.declined)
             network = self.network
-            names = [
+            names = (
                 f"{network.points[network.point_of[k]]} in {network.images[network.image_of[k]]}"
-                for k in rows[:8]
-            ]
-            more = f" and {len(rows) - 8} more" if len(rows) > 8 else ""
+                for k in rows
+            )
             found.append(
                 Remark(
                     f"{len(rows)} blurred targets were not measured and are left out: "
-                    f"{', '.join(names)}{more}; most often: {_usual_reason(last.measured)}",
+                    f"{listed(names, 8)}; most often: {_usual_reason(last.measured)}",
                     Code.DECLINED,
                 )
             )

@@ -46,6 +46,8 @@ _BEGINNING = 0.75
 """Least correlation at whole pixels."""
 _ALIKE = 0.8
 """Least correlation of a target with its formed image."""
+RESIDUALS = "residuals of targets"
+"""With what the remark on these begins; otherwise it is on the widths of what blurs beside the rays."""
 _DISTURBED = 2.5
 """Largest ratio of the residuals of a target to those of the others."""
 
@@ -510,7 +512,7 @@ class Run:
 
     def _notes(self, likeness: Likeness, results: list[tuple[Rows, Array, Matches]]) -> tuple[Remark, ...]:
         """Say if the images of all targets differ from those formed."""
-        said = f"residuals of targets are {likeness.misfit:.3g} times the noise beside them"
+        said = f"{RESIDUALS} are {likeness.misfit:.3g} times the noise beside them"
         if not likeness.unlike:
             good = [found.select(self.ok[rows]) for rows, _, found in results]
             width, sigma = (
