@@ -215,9 +215,9 @@ def test_a_stop_that_is_not_that_of_the_photographs_is_found_in_their_images() -
 
 def test_photographs_that_are_not_those_of_the_lens_are_named() -> None:
     entry = measured().rounds[1]
-    texts = {"i0": "residuals of targets are 3", "i2": "what blurs beside the rays is 0.4 px wide"}
+    note = (Remark("lens, focus or aperture are not those of the photograph", Code.INCONSISTENT),)
     unlike = {
-        name: replace(found, notes=(Remark(texts[name], Code.INCONSISTENT),) if name in texts else ())
+        name: replace(found, notes=note * (name != "i1"), uneven=name == "i2")
         for name, found in entry.measured.items()
     }
     by_residuals, by_widths = _misfits(replace(entry, measured=unlike))

@@ -29,7 +29,7 @@ from ..core.failure import Code, Failure, Remark
 from ..io.network import Network1
 from ..io.targets import SpaceTargets
 from ..measure.blurred import BlurredOptions, measure_blurred
-from ..measure.blurred.measure import RESIDUALS, BlurredResult
+from ..measure.blurred.measure import BlurredResult
 from ..measure.blurred.motion import Explained, measure_explained
 from ..measure.ordinary import ordinary_coordinates
 from ..optics.lenses import RayMap, ThinLens
@@ -331,11 +331,14 @@ def _misfits(entry: BlurredRound) -> tuple[Remark, ...]:
     The adjustment cannot tell: another lens shifts coordinates smoothly over the image, which distortion and
     object points take up. The matching can, as it compares the form of the images.
     """
-    by_residuals, by_widths = list[str](), list[str]()
-    for name, found in entry.measured.items():
-        for note in found.notes:
-            if note.code == Code.INCONSISTENT:
-                (by_residuals if note.text.startswith(RESIDUALS) else by_widths).append(name)
+    unlike = {
+        name: found.uneven
+        for name, found in entry.measured.items()
+        if any(note.code == Code.INCONSISTENT for note in found.notes)
+    }
+    by_residuals, by_widths = (
+        [name for name in unlike if unlike[name] is uneven] for uneven in (False, True)
+    )
     said = []
     if by_residuals:
         values = [entry.measured[name].misfit for name in by_residuals]

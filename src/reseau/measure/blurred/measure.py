@@ -46,8 +46,6 @@ _BEGINNING = 0.75
 """Least correlation at whole pixels."""
 _ALIKE = 0.8
 """Least correlation of a target with its formed image."""
-RESIDUALS = "residuals of targets"
-"""With what the remark on these begins; otherwise it is on the widths of what blurs beside the rays."""
 _DISTURBED = 2.5
 """Largest ratio of the residuals of a target to those of the others."""
 
@@ -149,6 +147,8 @@ class BlurredResult(Measured):
     misfit : float
         Residuals of the targets, in means over 3×3 pixels, ÷ those beside them, both in units of the noise of
         their grey values: about 1 where they are like their images; NaN if none was measured.
+    uneven : bool
+        Whether what blurs beside the rays differs from target to target, where images are like their targets.
 
     Examples
     --------
@@ -162,6 +162,7 @@ class BlurredResult(Measured):
     varied_sigma: Array = field(default_factory=lambda: np.zeros((0, 0)))
     rings: int = 0
     misfit: float = float("nan")
+    uneven: bool = False
     notes: tuple[Remark, ...] = ()
 
 
@@ -294,6 +295,7 @@ class Run:
             # What a stand-in does not know; the noise knows nothing of it, the remaining blur a part.
             blur2 = image.blur**2 + 2 * self.columns["psf_px"][k] ** 2
             self.columns["cov"][k] += self.camera.unknown**2 * blur2 * np.eye(2)
+        uneven = not likeness.unlike and self._uneven(results)
         return BlurredResult(
             image=self.frame.name,
             sha256=self.frame.sha256,
@@ -304,7 +306,8 @@ class Run:
             deviation=np.where(self.ok[:, None], self.columns["xy"] - self.predicted, np.nan),
             rings=rings,
             misfit=likeness.misfit,
-            notes=self._notes(likeness, results),
+            uneven=uneven,
+            notes=self._notes(likeness, uneven),
             **cast(Any, self.columns),
         )
 
@@ -510,27 +513,26 @@ class Run:
                 left.append(Residuals.of(self.screened.grey, start[good], found.residuals[good]))
         return Residuals.likeness(left) if left else Likeness(float("nan"), False)
 
-    def _notes(self, likeness: Likeness, results: list[tuple[Rows, Array, Matches]]) -> tuple[Remark, ...]:
-        """Say if the images of all targets differ from those formed."""
-        said = f"{RESIDUALS} are {likeness.misfit:.3g} times the noise beside them"
-        if not likeness.unlike:
-            good = [found.select(self.ok[rows]) for rows, _, found in results]
-            width, sigma = (
-                np.concatenate([getattr(found, name) for found in good] or [np.zeros(0)])
-                for name in ("psf_px", "psf_log_sigma")
-            )
-            pixels = sum(int(np.isfinite(found.residuals).sum()) for found in good)
-            # A stand-in leaves much, and not the same everywhere.
-            if len(width) < 2 or self.camera.unknown > 0 or not widths_differ(width, sigma, pixels):
-                return ()
-            said = (
-                f"what blurs beside the rays is {width.min():.2g} px wide at one target and "
-                f"{width.max():.2g} px at another"
-            )
-        unlike = "lens, focus or aperture are not those of the photograph"
-        return (
-            Remark(f"{said}: {unlike}, and places may be wrong by more than their sigmas", Code.INCONSISTENT),
+    def _uneven(self, results: list[tuple[Rows, Array, Matches]]) -> bool:
+        """Whether what blurs beside the rays differs from target to target; a stand-in leaves much there."""
+        good = [found.select(self.ok[rows]) for rows, _, found in results]
+        if sum(map(len, good)) < 2 or self.camera.unknown > 0:
+            return False
+        width, sigma = (
+            np.concatenate([getattr(found, name) for found in good]) for name in ("psf_px", "psf_log_sigma")
         )
+        return widths_differ(width, sigma, sum(int(np.isfinite(found.residuals).sum()) for found in good))
+
+    def _notes(self, likeness: Likeness, uneven: bool) -> tuple[Remark, ...]:
+        """Say if the images of all targets differ from those formed."""
+        said, width = "", self.columns["psf_px"][self.ok]
+        if likeness.unlike:
+            said = f"residuals of targets are {likeness.misfit:.3g} times the noise beside them"
+        elif uneven:
+            said = "what blurs beside the rays is "
+            said += f"{width.min():.2g} px wide at one target and {width.max():.2g} px at another"
+        text = "lens, focus or aperture are not those of the photograph, and places may be wrong by more"
+        return (Remark(f"{said}: {text} than their sigmas", Code.INCONSISTENT),) if said else ()
 
     def _images(self) -> tuple[int, PupilElements, list[RayImage | None]]:
         """Rings of elements of the stop, these elements, and images of all targets.
