@@ -27,9 +27,7 @@ from reseau.core.data import Array
 from reseau.core.tone import ToneCurve
 from reseau.execution import Executor
 from reseau.io.scans import scan_of
-from reseau.measure.film.orientation import curves_of_scan
-from reseau.measure.film.roll import curves_of_roll
-from reseau.measure.film.steps import CurveEvidence
+from reseau.measure.film.curves import CurveEvidence, curves_of_roll, curves_of_scan
 from reseau.procedures.film_frame import FrameOptions, FrameResult, orient_scan
 
 UNSTATED = ("unstated curve", "negative, density")
@@ -90,7 +88,7 @@ def one(job: tuple[str, int, bool, Array | None]) -> tuple[Row, CurveEvidence | 
     scan = scan_of(drawn.pixels, dpi=25.4 * drawn.px_per_mm)
     scan = replace(scan, curve=_curve(kind, KINDS[kind]) if stated else None)
     results = orient_scan(scan, FrameOptions(formats=(drawn.format_mm,), curves=share))
-    curves = curves_of_scan(scan, results)
+    curves = curves_of_scan(scan, (each.curves for each in results))
     found = [_compared(result, drawn.corners) for result in results if result.lines is not None and result]
     nothing = np.full((4, 2), np.nan)
     if not found:

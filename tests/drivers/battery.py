@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import ClassVar
+
+import pytest
 
 from reseau.core.errors import InstrumentError
 from reseau_sims.serving import Fault, FaultScript, Kind
@@ -46,7 +49,7 @@ def befall(
             assert found.machine.violations == []
 
 
-def endure(driver: str, transport: str, exchanges: int, rate: float) -> dict[str, float]:
+def _endure(driver: str, transport: str, exchanges: int, rate: float) -> dict[str, float]:
     """Exchange so often, with faults at random; what happened, in numbers."""
     script = FaultScript()
     with rig(driver, transport, script) as found:
@@ -74,13 +77,6 @@ def endure(driver: str, transport: str, exchanges: int, rate: float) -> dict[str
         }
 
 
-def endurance(driver: str, transport: str, record_property: Callable[[str, object], None]) -> None:
-    """Exchange as often as RESEAU_EXCHANGES says, and record what happened."""
-    found = endure(driver, transport, exchanges=int(os.environ.get("RESEAU_EXCHANGES", "10000")), rate=0.01)
-    for key, value in {"driver": driver, "transport": transport, **found}.items():
-        record_property(key, value)
-
-
 def _recovered(found: Rig) -> None:
     """Bring an instrument back that may fail again meanwhile."""
     patience = time.monotonic() + 20.0
@@ -90,3 +86,26 @@ def _recovered(found: Rig) -> None:
             return
         except InstrumentError:
             assert time.monotonic() < patience
+
+
+class Battery:
+    """What every rig is put through; `rigs` are the keys of those of a file, which one process tests."""
+
+    rigs: ClassVar[Sequence[tuple[str, str]]]
+
+    def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
+        if "driver" in metafunc.fixturenames:
+            metafunc.parametrize(("driver", "transport"), self.rigs)
+
+    def test_random_faults_never_give_a_wrong_answer(self, driver: str, transport: str) -> None:
+        _endure(driver, transport, exchanges=120, rate=0.03)
+
+    @pytest.mark.slow
+    @pytest.mark.timeout(1800)
+    def test_endurance(
+        self, driver: str, transport: str, record_property: Callable[[str, object], None]
+    ) -> None:
+        exchanges = int(os.environ.get("RESEAU_EXCHANGES", "10000"))
+        found = _endure(driver, transport, exchanges=exchanges, rate=0.01)
+        for key, value in {"driver": driver, "transport": transport, **found}.items():
+            record_property(key, value)

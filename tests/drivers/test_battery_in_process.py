@@ -8,31 +8,20 @@ import pytest
 
 from reseau_sims.serving import KINDS, Kind
 
-from .battery import befall, endurance, endure
+from .battery import Battery, befall
 from .rigs import RIGS
 
 pytestmark = pytest.mark.usefixtures("nothing_is_left_open")
-HERE = [key for key in RIGS if key[1] == "in process"]
 
 
-@pytest.mark.parametrize(
-    "at", [0, pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow)]
-)
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("driver", "transport"), HERE)
-def test_a_fault_gives_the_right_result_or_an_error_in_time(
-    driver: str, transport: str, kind: Kind, at: int, record_property: Callable[[str, object], None]
-) -> None:
-    befall(driver, transport, kind, at, record_property)
+class TestInProcess(Battery):
+    rigs = tuple(key for key in RIGS if key[1] == "in process")
 
-
-@pytest.mark.parametrize(("driver", "transport"), HERE)
-def test_random_faults_never_give_a_wrong_answer(driver: str, transport: str) -> None:
-    endure(driver, transport, exchanges=120, rate=0.03)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1800)
-@pytest.mark.parametrize(("driver", "transport"), HERE)
-def test_endurance(driver: str, transport: str, record_property: Callable[[str, object], None]) -> None:
-    endurance(driver, transport, record_property)
+    @pytest.mark.parametrize(
+        "at", [0, pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow)]
+    )
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_a_fault_gives_the_right_result_or_an_error_in_time(
+        self, driver: str, transport: str, kind: Kind, at: int, record_property: Callable[[str, object], None]
+    ) -> None:
+        befall(driver, transport, kind, at, record_property)

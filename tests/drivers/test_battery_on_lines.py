@@ -10,23 +10,25 @@ import pytest
 from reseau.core.errors import InstrumentError
 from reseau_sims.serving import KINDS, Kind
 
-from .battery import befall, endurance, endure
+from .battery import Battery, befall
 from .rigs import RIGS, rig
 
 pytestmark = pytest.mark.usefixtures("nothing_is_left_open")
-HERE = [key for key in RIGS if key[1] != "in process"]
+ON_LINES = tuple(key for key in RIGS if key[1] != "in process")
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("driver", "transport"), HERE)
-def test_a_fault_gives_the_right_result_or_an_error_in_time(
-    driver: str, transport: str, kind: Kind, record_property: Callable[[str, object], None]
-) -> None:
-    befall(driver, transport, kind, 2, record_property)
+class TestOnLines(Battery):
+    rigs = ON_LINES
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_a_fault_gives_the_right_result_or_an_error_in_time(
+        self, driver: str, transport: str, kind: Kind, record_property: Callable[[str, object], None]
+    ) -> None:
+        befall(driver, transport, kind, 2, record_property)
 
 
 @pytest.mark.parametrize(
-    ("driver", "transport"), [key for key in HERE if key[1] not in ("usbtmc", "udp", "request")]
+    ("driver", "transport"), [key for key in ON_LINES if key[1] not in ("usbtmc", "udp", "request")]
 )
 def test_reconnection_after_a_cable_was_pulled(driver: str, transport: str) -> None:
     with rig(driver, transport) as found:
@@ -51,15 +53,3 @@ def test_a_usb_instrument_is_found_again_after_its_cable_was_pulled() -> None:
         found.work(2)
         assert usb.open_handles == 1
         assert found.machine.violations == []
-
-
-@pytest.mark.parametrize(("driver", "transport"), HERE)
-def test_random_faults_never_give_a_wrong_answer(driver: str, transport: str) -> None:
-    endure(driver, transport, exchanges=120, rate=0.03)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1800)
-@pytest.mark.parametrize(("driver", "transport"), HERE)
-def test_endurance(driver: str, transport: str, record_property: Callable[[str, object], None]) -> None:
-    endurance(driver, transport, record_property)

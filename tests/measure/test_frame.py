@@ -14,6 +14,7 @@ from reseau.core.tone import ToneCurve
 from reseau.io.scans import scan_of
 from reseau.measure.film import orient_frames
 from reseau.measure.film.adjacent_lines import softness_of
+from reseau.measure.film.curves import curves_of_roll
 from reseau.measure.film.lines import (
     EdgeData,
     FrameShape,
@@ -23,7 +24,7 @@ from reseau.measure.film.lines import (
     robust_line,
 )
 from reseau.measure.film.orientation import FrameOptions, FrameResult
-from reseau.measure.film.roll import corner_files, curves_of_roll, rolls_of
+from reseau.measure.film.roll import corner_files, rolls_of
 from reseau.procedures.film_frame import reorient_scan
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 

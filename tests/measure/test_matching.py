@@ -377,25 +377,13 @@ def test_a_mark_without_a_finite_influence_leaves_the_covariances_of_the_others(
     alike = 3 * uniform_filter(rng.standard_normal(window.shape), (0, 3, 3))
     cov, influence = np.tile(np.eye(2), (30, 1, 1)), np.stack([window, window], axis=1) / 17
     columns = (one, one, one, one, none, one, one, one, 0 * one)
-    found = Matches(
-        *(
-            np.zeros((30, 2)),
-            cov,
-            *columns,
-            one > 0,
-            alike,
-            none,
-            np.zeros((30, 2, 0)),
-            influence,
-            0 * window,
-            one,
-        )
-    )
+    rest = (one > 0, alike, none, np.zeros((30, 2, 0)), influence, 0 * window, one)
+    found = Matches(np.zeros((30, 2)), cov, *columns, *rest)
     others = np.setdiff1d(np.arange(30), 3)
     usual = with_alike_errors(found.select(others))
     influence = influence.copy()
     influence[3], influence[7] = np.nan, 1e6 * influence[7]
     unusual = with_alike_errors(replace(found, influence=influence)).select(others)
     assert usual.cov[0, 0, 0] > 5
-    rest = others != 7
-    np.testing.assert_allclose(unusual.cov[rest], usual.cov[rest], atol=1e-3)
+    plain = others != 7
+    np.testing.assert_allclose(unusual.cov[plain], usual.cov[plain], atol=1e-3)

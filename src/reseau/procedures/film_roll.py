@@ -15,9 +15,8 @@ from ..core.provenance import Provenance
 from ..io import FrameCorners, FrameOrientation
 from ..io.frame import FrameOutcome, RollSummary
 from ..io.scans import Scan
-from ..measure.film.orientation import curves_of_scan
-from ..measure.film.roll import Kind, Roll, corner_files, curves_of_roll, rolls_of
-from ..measure.film.steps import CurveEvidence
+from ..measure.film.curves import CurveEvidence, curves_of_roll, curves_of_scan
+from ..measure.film.roll import Kind, Roll, corner_files, rolls_of
 from .film_frame import FrameOptions, FrameResult, orient_scan, orientation_of, reorient_scan
 
 
@@ -94,8 +93,8 @@ class FilmRollProcedure:
     def on_frame(self, frame: Frame, step: _Named) -> Verdict:
         """Orient the frames of a scan; a declined one may be oriented when the roll is known."""
         scan = self.opened(step.name)
-        self._results[step.name] = orient_scan(scan, self._options)
-        self._curves[step.name] = curves_of_scan(scan, self._results[step.name])
+        self._results[step.name] = results = orient_scan(scan, self._options)
+        self._curves[step.name] = curves_of_scan(scan, (each.curves for each in results))
         self._inputs[step.name] = frame.sha256
         return Verdict(True)
 

@@ -25,9 +25,8 @@ from ..execution import Executor
 from ..io import FrameCorners, FrameOrientation, write_whole
 from ..io.frame import FrameOutcome, RollSummary
 from ..io.images import open_scan, write_image
-from ..measure.film.orientation import curves_of_scan
-from ..measure.film.roll import Roll, corner_files, curves_of_roll, result_of, rolls_of
-from ..measure.film.steps import CurveEvidence
+from ..measure.film.curves import CurveEvidence, curves_of_roll, curves_of_scan
+from ..measure.film.roll import Roll, corner_files, result_of, rolls_of
 from ..procedures.film_frame import FrameOptions, FrameResult, orient_scan, orientation_of, reorient_scan
 from ..report.frames import contact_sheet, frame_tile, roll_page, scan_overlay, write_cut, write_marked
 
@@ -191,7 +190,8 @@ def _run(job: ScanJob, before: ScanOutcome | None = None) -> ScanOutcome:
         documents = [
             _required(orientation_of(result, calibrated, job.transform), job.image) for result in results
         ]
-        curves = curves_of_scan(scan, results) if before is None else before.curves
+        shown = (each.curves for each in results)
+        curves = curves_of_scan(scan, shown) if before is None else before.curves
         if job.out is not None:
             # A later run decides by the same results as this one about the curve, and the shapes of rolls.
             content: dict[str, Any] = {"frames": len(documents)}

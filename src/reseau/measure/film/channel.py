@@ -19,9 +19,10 @@ from .adjacent_lines import (
     soft_steps,
 )
 from .border import Band, Border, Film
+from .curves import CurveEvidence, probabilities_of
 from .edges import EdgeProfiles, measure_profiles, merged
 from .lines import Contender, EdgeData, Rival, departing_line, robust_line
-from .steps import CurveEvidence, Developed, StepForm, Tone, probabilities_of
+from .steps import Developed, StepForm, Tone
 
 _NEIGHBOURHOOD_PX = 0.05
 """Minimum contribution of an uneven gate and of picture content to the sigma of a profile."""
@@ -155,11 +156,13 @@ def measure_channel(
     tried = {0: found}
     log = found.shown.sum(axis=0)[:, 0]
     own = probabilities_of(log)
-    if np.argmax(own) and any((second := measured(taken := 1 + int(np.argmax((own * tones)[1:])))).data):
+    if np.argmax(own):
         # What a curve does to a step is computed for the measured one: neither of two curves is favoured.
-        tried[taken] = second
-        log = (log + second.shown.sum(axis=0)[:, 0]) / 2
-        own = probabilities_of(log)
+        second = 1 + int(np.argmax((own * tones)[1:]))
+        if any((other := measured(second)).data):
+            tried[second] = other
+            log = (log + other.shown.sum(axis=0)[:, 0]) / 2
+            own = probabilities_of(log)
     share = own if share is None else share
     best = int(np.argmax(share))
     # A blur on the film is one of the light for the scanner.

@@ -3,7 +3,7 @@ reason."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -29,10 +29,10 @@ from ...io import (
 from ...io.scans import Scan
 from .border import Band, read_band
 from .channel import WIDER_SEARCH, Channel, channels_by_contrast, measure_channel
+from .curves import CURVES, CurveEvidence, curves_of, curves_of_scan
 from .formats import ALL_FORMATS, FORMATS, format_probabilities, scale_by_perforations
 from .lines import EdgeData, FrameShape, Lines, adjust_lines, derived, explained_shape, shape_of
 from .search import FrameGuess, search_frames, size_of
-from .steps import CURVES, CurveEvidence, curves_of, decided_together, probabilities_of
 from .strips import in_reading_order, overview_of, rest_of_strip
 
 if TYPE_CHECKING:
@@ -340,14 +340,11 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
         results = [_oriented(scan, guess, reduction, options, scale) for guess in guesses]
         if any(results):
             found = in_reading_order(rest_of_strip(scan, results, options, _oriented))
-            common = curves_of_scan(scan, found)
-            if (
-                options.curves is None
-                and common is not None
-                and not all(common.like(r.curves) for r in found)
-            ):
-                return orient_frames(scan, replace(options, curves=common.share))
-            return found
+            own = [each.curves for each in found]
+            common = curves_of_scan(scan, own) if options.curves is None else None
+            if common is None or all(map(common.like, own)):
+                return found
+            return orient_frames(scan, replace(options, curves=common.share))
         # The reason why four edges are no frame is more useful than why three of them are none.
         declined = declined or results[:1]
     return declined
@@ -505,28 +502,6 @@ def _full_scale(scan: Scan, band: Callable[[int, bool], Band | None]) -> float:
     seen = (band(k, False) for k in range(4))
     top = max((float(np.nanmax(each.grey)) for each in seen if each is not None), default=1.0)
     return next((most for most in (1.0, 255.0, 65535.0) if top < 2 * most), top)
-
-
-def curves_of_scan(scan: Scan, results: Sequence[FrameResult]) -> CurveEvidence | None:
-    """What the frames of a scan together show of the curve of grey values; None if the scan states it.
-
-    Examples
-    --------
-    >>> from reseau.io.scans import scan_of
-    >>> curves_of_scan(scan_of(np.zeros((20, 30), np.uint8)), []).share[:3]
-    array([0.5 , 0.25, 0.1 ])
-    """
-    if scan.curve is not None:
-        return None
-    coding = f"{scan.dtype.name} {' '.join(scan.channels)}"
-    own = [each.curves for each in results if each.curves is not None]
-    if len(own) == 1:
-        return own[0]._replace(coding=coding)
-    log = moved = np.zeros(len(CURVES))
-    if own:
-        log, _ = decided_together(np.array([each.log for each in own]))
-        moved = np.mean([each.moved for each in own], axis=0)
-    return CurveEvidence(log, probabilities_of(log), moved, coding)
 
 
 def _candidates(curves: CurveEvidence | None) -> tuple[CurveCandidate, ...]:

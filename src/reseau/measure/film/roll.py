@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,7 +16,6 @@ from ...io import CORNERS, FrameCorners, FrameOrientation, FrameTransform
 from ..fitting import fit_mapping
 from .lines import FrameShape, Lines, shape_of
 from .orientation import FrameOptions, FrameResult
-from .steps import CurveEvidence, decided_together
 
 Kind = Literal["similarity", "affine", "projective", "bilinear"]
 
@@ -204,28 +203,6 @@ def rolls_of(results: Sequence[FrameResult], dpi: float | None = None) -> tuple[
         for size, count in number.most_common()
         if count >= _LEAST_FRAMES
     )
-
-
-def curves_of_roll(scans: Iterable[CurveEvidence | None]) -> list[CurveEvidence | None]:
-    """What all scans of a roll together show of the curve of each; None where it is stated.
-
-    Examples
-    --------
-    >>> one = CurveEvidence(np.array([0.0, 5, 0, 0, 0, 0, 0, 0, 0]), np.eye(9)[0], np.zeros(9), "uint8 grey")
-    >>> [float(curves_of_roll([one] * count)[0].share[1].round(3)) for count in (1, 2)]
-    [0.0, 1.0]
-    """
-    found = list(scans)
-    known = {k: each for k, each in enumerate(found) if each is not None}
-    for coding in {each.coding for each in known.values()}:
-        alike = [k for k, each in known.items() if each.coding == coding]
-        if len(alike) > 1:
-            _, shares = decided_together(np.array([known[k].log for k in alike]))
-            found = [
-                known[k]._replace(share=shares[alike.index(k)]) if k in alike else each
-                for k, each in enumerate(found)
-            ]
-    return found
 
 
 def corner_files(rolls: Sequence[Roll]) -> dict[str, FrameCorners]:

@@ -16,7 +16,7 @@ the grid to the next, by up to 0.1 px, and neighbouring profiles alike.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,14 +36,10 @@ _ROOT = float(np.sqrt(2 * np.pi))
 
 _LEAST_LIGHT = 1e-4
 """Least light, as a share of full scale, so that noise about zero has a grey value."""
-_SRGB = 2.4, 0.055
+SRGB = 2.4, 0.055
 """Exponent of the curve of sRGB above its linear part, and the grey value that is added before."""
 _POWER = 0.01
 """The same for powers."""
-_DENSE, _DENSITIES = 3.0, (2.0, 3.0, 4.0)
-"""The same for densities, and the largest ones of scanners."""
-_SHARES, _DEVELOPED = (0.3, 0.6, 1.0), "proportional to the light, with a penumbra or halation on the film"
-"""Widths of blurs on the film, in those of the steps, and what they are."""
 _WITHIN = 1e-3, 1 - 1e-3
 """Range of the share of light at the half of a step."""
 
@@ -75,7 +71,7 @@ class Tone:
         if curve is None or curve.linear:
             return STRAIGHT
         if curve.exponent is None and not curve.table:
-            return cls(*_SRGB, full_scale, polarity)
+            return cls(*SRGB, full_scale, polarity)
         middle = float(curve.light(np.array([0.5]), 1.0)[0])
         exponent = curve.exponent or float(np.log(max(middle, 1e-3)) / np.log(0.5))
         return cls(exponent, _POWER, full_scale, polarity)
@@ -149,117 +145,6 @@ class Developed:
         if self.polarity > 0:
             return np.asarray(np.maximum(3.0 / density - 1, 1e-3) ** (1 / 1.6))
         return np.asarray(np.maximum(2.0 / density - 1, 1e-3) ** (-1 / 0.95))
-
-
-CURVES: tuple[tuple[str, float], ...] = (
-    ("proportional to the light", 0.5),
-    ("those of sRGB", 0.25),
-    ("a power of 1.8", 0.1),
-    *((f"densities up to {most:g}", 0.03) for most in _DENSITIES),
-    *((_DEVELOPED, 0.02) for _ in _SHARES),
-)
-"""Curves that grey values may have where a file states none, with their prior probabilities."""
-_ODD = 0.02
-"""Prior probability that a frame has a curve of its own, or shows one only because its edges are bent for
-another reason: half of it for each."""
-_SAME_PX = 0.005
-"""Displacement of an edge, and difference of its standard deviation, that does not matter: pixels."""
-
-
-def curves_of(curve: ToneCurve | None, full_scale: float, polarity: int) -> list[Tone | Developed]:
-    """The curve that a file states; those of `CURVES` if it states none.
-
-    Densities up to D are powers of a grey value to which much is added: (1 + x/n)ⁿ of D ln 10.
-    """
-    if curve is not None:
-        return [Tone.of_file(curve, full_scale, polarity)]
-    straight = replace(STRAIGHT, scale=full_scale, polarity=polarity)
-    return [
-        straight,
-        Tone(*_SRGB, full_scale, polarity),
-        replace(straight, gamma=1.8),
-        *(replace(straight, gamma=d * float(np.log(10)) * (1 + _DENSE), added=_DENSE) for d in _DENSITIES),
-        *(Developed(share, full_scale, polarity) for share in _SHARES),
-    ]
-
-
-def probabilities_of(log: Array) -> Array:
-    """Probabilities (…, k) of the curves by the logarithms of their likelihoods."""
-    return np.asarray(scipy.special.softmax(np.log([prior for _, prior in CURVES]) + log, axis=-1))
-
-
-def decided_together(log: Array) -> tuple[Array, Array]:
-    """One curve for several frames, or scans of frames, of one scanner.
-
-    Most show the same curve. What one shows may be a curve of its own; or its edges are bent for another
-    reason and show nothing of the curve, which is that of the others.
-
-    Parameters
-    ----------
-    log : ndarray (n, k)
-        Logarithms of the likelihoods of the curves by the edges of each.
-
-    Returns
-    -------
-    (ndarray (k,), ndarray (n, k))
-        Logarithm of the likelihood by all of them; and probabilities of the curves for each.
-
-    Examples
-    --------
-    Two of three frames show sRGB, and one nothing:
-
-    >>> log = np.zeros((3, len(CURVES)))
-    >>> log[:2, 1] = 8.0
-    >>> decided_together(log)[1][:, 1].round(2)
-    array([1.  , 1.  , 0.99])
-    """
-    alike = np.log(1 - _ODD) + log
-    # What an odd one shows is any of the curves, with their prior probabilities.
-    odd = np.log(_ODD) + scipy.special.logsumexp(log, axis=1, b=[each for _, each in CURVES], keepdims=True)
-    either = np.logaddexp(alike, odd)
-    shown = either.sum(axis=0)
-    common, half = probabilities_of(shown), np.exp(odd - either) / 2
-    return shown, common * (1 - half) + (half @ common)[:, None] * probabilities_of(log)
-
-
-class CurveEvidence(NamedTuple):
-    """What edges show of the curve of grey values that a file does not state, for each of `CURVES`.
-
-    Parameters
-    ----------
-    log : ndarray (k,)
-        Logarithms of the likelihoods.
-    share : ndarray (k,)
-        Probabilities with which the edges were measured: by these edges, or by all of a roll.
-    moved : ndarray (k,)
-        How far inwards each puts the edges, against their mean, pixels.
-    coding : str
-        Type of the grey values and channels: scans of one roll that differ in it may differ in their curve.
-    """
-
-    log: Array
-    share: Array
-    moved: Array
-    coding: str = ""
-
-    @classmethod
-    def from_dict(cls, content: dict[str, Any]) -> CurveEvidence:
-        """Read what :meth:`to_dict` has written."""
-        log, share, moved = (np.array(content[name]) for name in ("log", "share", "moved"))
-        return cls(log, share, moved, content["coding"])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content for a file."""
-        return {name: each if name == "coding" else each.tolist() for name, each in self._asdict().items()}
-
-    def like(self, other: CurveEvidence | None) -> bool:
-        """Whether the probabilities of the curves put edges where those of other evidence do."""
-        if other is None:
-            return True
-        shares = np.array([self.share, other.share])
-        mean = shares @ other.moved
-        spread = np.sqrt((shares * (other.moved - mean[:, None]) ** 2).sum(axis=1))
-        return bool(max(abs(np.diff(mean)), abs(np.diff(spread))) < _SAME_PX)
 
 
 class StepForm(NamedTuple):
