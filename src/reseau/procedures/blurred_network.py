@@ -240,7 +240,11 @@ def measure_blurred_network(
     rounds = [BlurredRound(first, {}, none, ~none, none, 0.0)]
     say(f"ordinary coordinates: sigma0 {first.sigma0:.4g}")
     for number in range(1, chosen.rounds + 1):
-        found = run.round(rounds[-1].result)
+        # The ordinary coordinates of blurred targets turn the photographs: what the first measurement by rays
+        # corrects needs no explanation.
+        found = run.round(rounds[-1].result, explain=number > 1 or chosen.rounds == 1)
+        if isinstance(found, Failure) and number == 1 < chosen.rounds:
+            found = run.round(first, explain=True)
         if isinstance(found, Failure):
             if number == 1:
                 return found
@@ -419,8 +423,11 @@ class _Run:
         self.xyz, self.reasons = network.xyz.copy(), dict[str, Explained | None]()
         self.matching = replace(options.matching, polarity=targets.polarity)
 
-    def round(self, last: Result) -> BlurredRound | Failure:
-        """Measure all targets with the images that follow from an adjustment, and adjust again."""
+    def round(self, last: Result, *, explain: bool) -> BlurredRound | Failure:
+        """Measure all targets with the images that follow from an adjustment, and adjust again.
+
+        Where asked to, photographs whose targets are not like these images are explained.
+        """
         network, n = self.network, len(self.network.xy)
         xy, cov = network.xy.copy(), network.cov.copy()
         replaced, declined = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
@@ -438,13 +445,16 @@ class _Run:
         jobs = ((image, self._job(last, image, rows)) for image, rows in of_image.items())
         # A photograph is explained once: another orientation changes its images hardly.
         known = (
-            (image, _Again(job, self.reasons[image]) if image in self.reasons else job) for image, job in jobs
+            (image, job if explain and image not in self.reasons else _Again(job, self.reasons.get(image)))
+            for image, job in jobs
         )
         for image, outcome in self.executor.outcomes(_measured, known):
             if isinstance(outcome, Failure):
                 return outcome
-            found, self.reasons[image] = outcome
-            measured[image] = found
+            measured[image], reason = outcome
+            found = measured[image]
+            if explain:
+                self.reasons[image] = reason
             for k, own in enumerate(of_image[image]):
                 if self._stays(found, k, own):
                     continue

@@ -32,7 +32,7 @@ _WINDOWS = (8, 10, 12, 14, 17, 20, 24, 28, 34, 40, 48, 57, 68, 81, 96, 115, 137,
 RINGS = (4, 6, 8, 11)
 """Rings of elements of the stop: each step doubles the number of rays."""
 _SETTLED = 0.1
-"""More rays no longer matter if they shift the match by less than this many of its standard deviations."""
+"""More rays no longer matter if what is judged changes by less than this part of its standard deviation."""
 _LEAST_SHIFT = 0.0005
 """… or by less than this many pixels."""
 _CRITICAL = 4
@@ -570,11 +570,19 @@ class Run:
         return rings, elements, images(elements)
 
     def _alike(self, formed: NDArray[Any], finer: NDArray[Any]) -> bool:
-        """Whether two formed images differ by an insignificant shift under the noise of the frame."""
+        """Whether two formed images differ insignificantly under the noise, in all that is judged.
+
+        Which is the place, the width, and what is left, in the residuals of all targets together.
+        """
+        unit = float(np.ptp(self.screened.grey)) / 2 / self.screened.noise
         down, right = np.gradient(finer)
-        design = np.stack([right.ravel(), down.ravel(), finer.ravel(), np.ones(finer.size)], axis=1)
+        wider = np.gradient(right, axis=1) + np.gradient(down, axis=0)
+        design = np.stack([part.ravel() for part in (right, down, wider, finer, np.ones_like(finer))], axis=1)
         cofactor = np.linalg.inv(design.T @ design)
-        shift = (cofactor @ design.T @ (finer - formed).ravel())[:2]
-        contrast = float(np.ptp(self.screened.grey)) / 2
-        sigma = np.sqrt(np.diagonal(cofactor)[:2]) * self.screened.noise / contrast
-        return bool((np.abs(shift) < np.maximum(_SETTLED * sigma, _LEAST_SHIFT)).all())
+        off = (finer - formed).ravel()
+        change = cofactor @ design.T @ off
+        allowed = _SETTLED * np.sqrt(np.diagonal(cofactor)[:3]) / unit
+        allowed[:2] = np.maximum(allowed[:2], _LEAST_SHIFT)
+        left = float(np.sum((off - design @ change) ** 2)) * unit**2
+        scatter = float(np.sqrt(2 * off.size / len(self.ids)))
+        return bool((np.abs(change[:3]) < allowed).all() and left < _SETTLED * scatter)

@@ -295,7 +295,8 @@ class _Compared:
         )
         self.frame, self.camera, self.altered, self.per_line = frame, camera, altered, per_line
         self.targets, self.centres = [targets[int(k)] for k in some], centres[some]
-        self.options = replace(options, varied=None, rings=options.rings or RINGS[0])
+        self.settled = replace(options, varied=None)
+        self.options = replace(self.settled, rings=options.rings or RINGS[0])
         self.basis = self._basis() if len(some) else np.zeros((6, 6))
         self.halves: dict[int, int] = {}
 
@@ -336,7 +337,9 @@ class _Compared:
             if not isinstance(image, Failure):
                 self.halves[k] = run.half(image)
 
-    def fitted(self, kind: Kind, before: Explained | None) -> Explained | None:
+    def fitted(
+        self, kind: Kind, before: Explained | None, options: BlurredOptions | None = None
+    ) -> Explained | None:
         """Estimate the parameters of an explanation, beginning with those of a smaller one."""
         start = self._start(kind, before)
         motions = kind.parameters - len(kind.lens)
@@ -348,7 +351,9 @@ class _Compared:
             room = 1.5 * extent + 1.0
             view = partial(self.view, kind, _steps(room))
             varied = Varied(names, sigma, view)
-            found = estimate_optics(self.frame, self.targets, varied, self.options, start, self.halves)
+            found = estimate_optics(
+                self.frame, self.targets, varied, options or self.options, start, self.halves
+            )
             if isinstance(found, Failure):
                 return None
             extent, start = self._extent(found.camera), found.values
@@ -390,12 +395,18 @@ class _Compared:
             np.mean([0.0 if isinstance(image, Failure) else run.correlated(image)[0] for image in images])
         )
 
-    def like(self, reason: Explained) -> bool:
-        """Whether nothing is left to be explained."""
-        found = measure_blurred(
-            self.frame, reason.optics.camera, ("",) * len(self.targets), self.targets, self.options
-        )
-        return bool(found.ok.any()) and not found.notes
+    def finest(self, reason: Explained) -> tuple[Explained, bool]:
+        """The explanation by as many rays as images need, and whether nothing is left to explain."""
+        found = self._measured(reason)
+        if found.rings > (self.options.rings or 0):
+            finer = self.fitted(reason.kind, reason, replace(self.options, rings=found.rings))
+            if finer is not None:
+                reason, found = finer, self._measured(finer)
+        return reason, bool(found.ok.any()) and not found.notes
+
+    def _measured(self, reason: Explained) -> BlurredResult:
+        names = ("",) * len(self.targets)
+        return measure_blurred(self.frame, reason.optics.camera, names, self.targets, self.settled)
 
     def gain(self, small: Explained, large: Explained) -> float:
         """By how much the logarithm of the likelihood of the larger explanation is better than it costs."""
@@ -460,7 +471,7 @@ def explained(
     if not compared.targets:
         return None
     compared.look()
-    best = compared.fitted(Kind(), None)
+    best = finest = compared.fitted(Kind(), None)
     while True:
         larger = [
             found
@@ -474,10 +485,11 @@ def explained(
             continue
         winner = max(larger, key=partial(compared.gain, best), default=best)
         if winner is best or compared.gain(best, winner) <= 0:
-            return best if best.kind.parameters else None
+            return finest if best.kind.parameters else None
         best = winner
-        if compared.like(best):
-            return best
+        finest, like = compared.finest(best)
+        if like:
+            return finest
 
 
 def measure_explained(
