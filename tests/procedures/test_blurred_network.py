@@ -202,7 +202,7 @@ def test_a_stop_that_is_not_that_of_the_photographs_is_found_in_their_images() -
     project = drawn()
     assert all(abs(each.misfit - 1) < 0.2 for each in measured().rounds[1].measured.values())
     narrow = replace(underwater.CAMERA, lens=replace(underwater.LENS, stop_radius=3.5))
-    options = NetworkOptions(rounds=1)
+    options = NetworkOptions(rounds=2)
     found = measure_blurred_network(project.network, project.frames, project.targets, narrow, options)
     assert isinstance(found, BlurredNetwork)
     said = [note.text for note in found.notes if "the stop was estimated" in note.text]

@@ -65,7 +65,8 @@ class NetworkOptions:
     matching : BlurredOptions
         Measurement of the targets; its polarity is that of the targets.
     rounds : int
-        Largest number of rounds.
+        Largest number of rounds. What a lens does not explain is explained from the second on, or where the
+        first fails.
     keep_sharp : bool
         Whether ordinary coordinates of sharp targets are kept where they do not differ significantly from
         those by rays. Coordinates that `initial` measures must not be less certain either.
@@ -136,7 +137,8 @@ class BlurredNetwork(Display):
     rounds : tuple of BlurredRound
         The adjustment of the ordinary coordinates, and every round after it.
     chosen : int
-        The round with the smallest sigma0 of those that were measured by rays: the result.
+        The round with the smallest sigma0 of those that were measured by rays, and with what explains the
+        photographs where that is more than their lens: the result.
     notes : tuple of Remark
         What a user should know.
 
@@ -242,8 +244,8 @@ def measure_blurred_network(
     for number in range(1, chosen.rounds + 1):
         # The ordinary coordinates of blurred targets turn the photographs: what the first measurement by rays
         # corrects needs no explanation.
-        found = run.round(rounds[-1].result, explain=number > 1 or chosen.rounds == 1)
-        if isinstance(found, Failure) and number == 1 < chosen.rounds:
+        found = run.round(rounds[-1].result, explain=number > 1)
+        if isinstance(found, Failure) and number == 1:
             found = run.round(first, explain=True)
         if isinstance(found, Failure):
             if number == 1:
@@ -254,10 +256,13 @@ def measure_blurred_network(
             f"round {number}: {int(found.replaced.sum())} by rays, {int(found.kept.sum())} kept, "
             f"{int(found.declined.sum())} left out; sigma0 {found.result.sigma0:.4g}"
         )
-        if number > 1 and found.result.sigma0 >= _FALLS * rounds[-2].result.sigma0:
+        before = rounds[-2]
+        same = bool(_explained(found)) == bool(_explained(before))
+        if number > 1 and same and found.result.sigma0 >= _FALLS * before.result.sigma0:
             break
-    sigma0 = [entry.result.sigma0 for entry in rounds[1:]]
-    best = 1 + int(np.argmin(sigma0))
+    # What was measured with another lens than that of the photographs has other sigmas.
+    explained = [k for k, entry in enumerate(rounds) if _explained(entry)]
+    best = min(explained or range(1, len(rounds)), key=lambda k: rounds[k].result.sigma0)
     return BlurredNetwork(tuple(rounds), best, run.notes(rounds, best))
 
 
