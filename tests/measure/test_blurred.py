@@ -15,7 +15,7 @@ from reseau.measure.blurred import BlurredOptions, estimate_optics, measure_blur
 from reseau.measure.blurred.estimate import EstimatedOptics
 from reseau.measure.blurred.likeness import Residuals, widths_differ
 from reseau.measure.blurred.measure import Varied
-from reseau.measure.blurred.motion import Motion, Moving, explained, measure_explained
+from reseau.measure.blurred.motion import Kind, Motion, Moving, _Compared, explained, measure_explained
 from reseau.measure.blurred.shapes import RayShapes
 from reseau.measure.matching.shapes import Window
 from reseau.optics.formation import Outline, PixelResponse
@@ -144,6 +144,20 @@ def test_motion_explains_what_a_lens_at_rest_does_not(steps: Array, said: str) -
     assert (reason is not None) == bool(said)
     assert reason is None or abs(reason.extent_px - np.sqrt(48)) < 0.05  # its sigma is 0.04
     assert np.abs(found.xy[0] - blurs.principal_pixel(CENTRE)).max() < 0.02
+
+
+@pytest.mark.slow
+def test_a_motion_is_told_where_no_target_is_like_its_image_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with motions over 37 px, which take minutes."""
+    fitted = _Compared.fitted
+    monkeypatch.setattr(
+        _Compared, "fitted", lambda own, kind, *rest: fitted(own, kind, *rest) if kind != Kind() else None
+    )
+    moved = np.mean([np.roll(drawn(), step, axis=1) for step in range(-3, 4)], axis=0)
+    frame = Frame(moved + np.random.default_rng(1).normal(0, 1.0, moved.shape), 255.0)
+    reason = explained(frame, camera(), [target()])
+    assert reason is not None
+    assert abs(reason.extent_px - np.sqrt(48)) < 0.1
 
 
 @pytest.mark.slow

@@ -385,14 +385,14 @@ class _Job(NamedTuple):
     options: BlurredOptions
 
 
-class _Again(NamedTuple):
-    """A photograph that was measured before, and what explained it beside its lens."""
+class _Known(NamedTuple):
+    """A photograph for which no explanation is sought, with the one that it has beside its lens."""
 
     job: _Job
     reason: Explained | None
 
 
-def _measured(job: _Job | _Again) -> tuple[BlurredResult, Explained | None]:
+def _measured(job: _Job | _Known) -> tuple[BlurredResult, Explained | None]:
     if isinstance(job, _Job):
         return measure_explained(*job, altered=alterable(job.camera))
     job, reason = job
@@ -450,7 +450,7 @@ class _Run:
         jobs = ((image, self._job(last, image, rows)) for image, rows in of_image.items())
         # A photograph is explained once: another orientation changes its images hardly.
         known = (
-            (image, job if explain and image not in self.reasons else _Again(job, self.reasons.get(image)))
+            (image, job if explain and image not in self.reasons else _Known(job, self.reasons.get(image)))
             for image, job in jobs
         )
         for image, outcome in self.executor.outcomes(_measured, known):

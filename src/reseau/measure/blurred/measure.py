@@ -584,5 +584,6 @@ class Run:
         allowed = _SETTLED * np.sqrt(np.diagonal(cofactor)[:3]) / unit
         allowed[:2] = np.maximum(allowed[:2], _LEAST_SHIFT)
         left = float(np.sum((off - design @ change) ** 2)) * unit**2
+        # The sum over all targets has as many times the squares, and their root times the scatter.
         scatter = float(np.sqrt(2 * off.size / len(self.ids)))
         return bool((np.abs(change[:3]) < allowed).all() and left < _SETTLED * scatter)

@@ -405,6 +405,7 @@ class _Compared:
         return reason, bool(found.ok.any()) and not found.notes
 
     def _measured(self, reason: Explained) -> BlurredResult:
+        """The targets by as many rays as their images need."""
         names = ("",) * len(self.targets)
         return measure_blurred(self.frame, reason.optics.camera, names, self.targets, self.settled)
 
@@ -471,7 +472,7 @@ def explained(
     if not compared.targets:
         return None
     compared.look()
-    best = finest = compared.fitted(Kind(), None)
+    best, finest = compared.fitted(Kind(), None), None
     while True:
         larger = [
             found
@@ -482,10 +483,11 @@ def explained(
             if not larger:
                 return None
             best = max(larger, key=lambda each: len(each.optics.costs))
+            finest, _ = compared.finest(best)
             continue
         winner = max(larger, key=partial(compared.gain, best), default=best)
         if winner is best or compared.gain(best, winner) <= 0:
-            return finest if best.kind.parameters else None
+            return finest
         best = winner
         finest, like = compared.finest(best)
         if like:
