@@ -449,12 +449,13 @@ def test_grey_values_are_measured_with_the_curve_that_the_file_states_or_the_edg
 def test_ends_of_a_wavy_edge_are_as_uncertain_as_it_departs_from_a_line() -> None:
     place, sigma = np.linspace(-1, 1, 300), np.full(300, 0.05)
     noise = np.random.default_rng(0).normal(0, 0.05, 300)
-    none = np.zeros(300), np.zeros((300, 0)), np.zeros((300, 0))
-    _, covariance, departs, _ = departing_line(place, noise, sigma, *none)
+    none = np.zeros((300, 0)), np.zeros(300), np.zeros((300, 1))
+    _, (covariance,), (departs,), _ = departing_line(place, noise, sigma, *none)
     assert departs < 0.03
     assert np.sqrt(np.diag(covariance))[:2].max() < 0.03
     # A line through one wave of 0.5 px, weighted evenly, misses its ends by 0.48 px.
-    values, covariance, departs, _ = departing_line(place, noise + 0.5 * np.sin(np.pi * place), sigma, *none)
+    wavy = noise + 0.5 * np.sin(np.pi * place)
+    (values,), (covariance,), (departs,), _ = departing_line(place, wavy, sigma, *none)
     assert 0.1 < departs < 0.5
     assert (np.abs(values[:2]) < 2 * np.sqrt(np.diag(covariance))[:2]).all()
     assert np.abs(values[:2]).max() < 0.2

@@ -10,18 +10,11 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Mask
-from .adjacent_lines import (
-    AdjacentEdge,
-    Softness,
-    common_forms,
-    displaced_by_lines,
-    edge_beside_line,
-    soft_steps,
-)
+from .adjacent_lines import Softness, beside_edge, common_forms, soft_steps
 from .border import Band, Border, Film
 from .curves import CurveEvidence, probabilities_of
 from .edges import EdgeProfiles, measure_profiles, merged
-from .lines import Contender, EdgeData, Rival, departing_line, robust_line
+from .lines import Contender, EdgeData, Rival, departing_line, mixed, robust_line
 from .steps import Developed, StepForm, Tone
 
 _NEIGHBOURHOOD_PX = 0.05
@@ -36,7 +29,6 @@ _FOREIGN = 0.08
 from which it is no film."""
 _UNEVEN = 0.45
 """Share of its own tone by which film may differ between edges, because the scanner's light is uneven."""
-_BESIDE = "a line of the picture beside it"
 _TURNED, _ROUNDED, _MARGIN = 1.2, 0.25, 0.015
 """Sigmas by which neighbouring profiles lie inwards at a rounded corner, share of half an edge that the
 corner may take, and additional margin."""
@@ -225,7 +217,7 @@ def _measured(
             found = found if more is None else merged(found, more)
         profiles[k] = found
     edges = [
-        _edge(band(k, False, far[k]), found, soft, channel, polarity, forms, taken)
+        _edge(band(k, False, far[k]), found, soft, forms, taken)
         for k, (found, soft) in enumerate(zip(profiles, soft_steps(profiles, side), strict=True))
     ]
     data, rejected, why = (list(column) for column in zip(*edges, strict=True))
@@ -250,8 +242,6 @@ def _edge(
     band: Band | None,
     found: EdgeProfiles | None,
     soft: Softness,
-    channel: int,
-    polarity: int,
     forms: Sequence[Tone | Developed],
     taken: int,
 ) -> tuple[EdgeData | None, int, str]:
@@ -260,9 +250,11 @@ def _edge(
         return None, 0, "is not in the scan, or nothing separates it from the picture"
     if found is None:
         return None, 0, "no contrast between film and picture"
-    drawn, beside, moves = (part[found.good] for part in displaced_by_lines(found, soft))
+    around = beside_edge(found, soft, float(np.hypot(*(band.stop - band.start))))
+    beside, moved = around.share[found.good], around.moved.T[found.good]
+    drawn, of_line = around.scatter[:, found.good]
     place, offset, own = (part[found.good] for part in (found.place, found.offset, found.sigma))
-    sigma, offset = np.hypot(own, drawn), offset - moves
+    sigma, offset = np.hypot(own, drawn), offset - moved[:, 0]
     line = _line(place, offset, sigma, own)
     rejected = int((~found.good).sum())
     if line is None:
@@ -279,39 +271,38 @@ def _edge(
     if _spans(place[beside < 0.5]):
         # The edge is seen by itself beside the structures that displace some of its steps.
         agree &= beside < 0.5
-    rival, two = _rival(band, found, soft, band.grey[:, :, channel].astype(np.float64) * polarity, near)
-    doubt = float(np.hypot(doubt, np.sqrt(rival.probability) * rival.moved_px))
-    if two is not None:
-        at = np.append(two.ends, two.bow + near[2])
-        covariance = np.diag([0.0, 0.0, soft.width**2 + near[2] ** 2])
-        covariance[:2, :2] = two.covariance + common**2 + doubt**2 * np.eye(2)
-        xy = band.at(place, -_inward(at, place, 0 * place))
-        return (
-            EdgeData(at, covariance, xy, np.zeros(0), 0.0, doubt, rival, np.zeros((len(forms), 2))),
-            rejected,
-            "",
-        )
-    if (beside > 0.5).any() and rival.probability < beside.max():
-        # The sigmas of these profiles contain it.
-        moved = float(np.abs(moves[beside > 0.5]).max())
-        where = f"a line of the picture beside {np.mean(beside > 0.5):.0%} of it"
-        rival = Rival(where, float(beside.max()), -moved)
     residuals = _inward(near, place, offset)
     agree &= _straight(place, residuals / np.hypot(sigma, _NEIGHBOURHOOD_PX))
     # A structure of the picture lies inwards of the edge; parts of an edge that is bent lie on both sides.
     used = agree | (agree.mean() < _BENT and not _only_inwards(residuals, line[1]))
     harmonics = band.harmonics(place, offset - residuals)
     curved = _curved(found, forms, taken)[found.good]
-    values, covariance, departs, likelihood = departing_line(
-        *(each[used] for each in (place, offset, own, drawn, harmonics, curved))
-    )
+    steps = place[used], offset[used], own[used], harmonics[used]
+    parts = departing_line(*steps, drawn[used], np.insert(curved[used], 0, 0.0, axis=1), hidden=True)
+    lines = departing_line(*steps, of_line[used], (moved[:, 1:] - moved[:, :1])[used])
+    log = around.log + np.append(parts.log[0], lines.log)
+    share = np.exp(log - scipy.special.logsumexp(log))
+    ends = np.concatenate([parts.values[:1], lines.values])
+    values, covariance = mixed(share, ends, np.concatenate([parts.covariance[:1], lines.covariance]))
+    lined = float(share[1:].sum())
+    rival = _rival(beside, moved[:, 0], lined, (share[1:] @ lines.values / max(lined, 1e-12) - ends[0])[:2])
+    # With a line beside it, the edge says nothing about the curve.
+    likelihood = np.log(lined + share[0] * np.exp(np.minimum(parts.log[1:] - parts.log[0], 600.0)))
     shown = np.stack([likelihood, -np.median(curved[used], axis=0)], axis=1)
     # Steps that are too sharp belong to a scratch and are equally uninformative.
-    doubt = float(np.sqrt(doubt**2 + soft.sharpened * soft.width**2))
-    covariance[:2, :2] += common**2 + (_MODEL_PX**2 + doubt**2) * np.eye(2)
+    square = doubt**2 + soft.sharpened * soft.width**2
+    covariance[:2, :2] += common**2 + (_MODEL_PX**2 + square) * np.eye(2)
+    doubt = float(np.sqrt(square + share @ ((ends - values) ** 2)[:, :2].mean(axis=1)))
     rest = _inward(values, place[used], offset[used])
     data = EdgeData(
-        values, covariance, band.at(place[used], offset[used]), rest, departs, doubt, rival, shown
+        values,
+        covariance,
+        band.at(place[used], offset[used]),
+        rest,
+        float(parts.departs[0]),
+        doubt,
+        rival,
+        shown,
     )
     return data, rejected + int((~used).sum()), ""
 
@@ -325,30 +316,16 @@ def _curved(found: EdgeProfiles, forms: Sequence[Tone | Developed], taken: int) 
     return np.asarray(width * away - found.width * away[:, taken, None])
 
 
-def _rival(
-    band: Band, found: EdgeProfiles, soft: Softness, grey: Array, line: Array
-) -> tuple[Rival, AdjacentEdge | None]:
-    """The second best explanation of an edge, and the edge itself if a line beside it is the best one.
+def _rival(beside: Array, moves: Array, lined: float, moved: Array) -> Rival:
+    """The line of the picture that is most probably beside an edge, or beside parts of it.
 
-    Edge and line are adjusted together where the widths of the steps make a line more probable than anywhere.
+    `beside` and `moves` are probabilities of a second step and displacements by it, `lined` the probability
+    of a line beside all of the edge, which moves its ends by `moved`.
     """
-    rival = Rival(_BESIDE, soft.lined, -soft.displaced)
-    if soft.lined <= soft.before:
-        return rival, None
-    (start, stop, bow), border = line, found.border
-    fitted = (start * (1 - band.place) + stop * (1 + band.place)) / 2
-    fitted = fitted - bow * (1 - band.place**2)
-    shown = float(np.exp(np.median(found.blur[0][found.good])))
-    two, gain = edge_beside_line(grey, band, fitted, border.level, border.noise, soft.width, shown, bow)
-    odds = soft.lined / (1 - soft.lined) * np.exp(np.clip(gain, -20, 20))
-    lined = float(odds / (1 + odds))
-    if two is None:
-        return replace(rival, probability=lined), None
-    away = two.ends - np.array([start, stop])
-    moved = float(away[np.abs(away).argmax()])
-    if lined > 0.5:
-        return Rival("softness of its own, without a line beside it,", 1 - lined, -moved), two
-    return Rival(_BESIDE, lined, moved), None
+    if (beside > 0.5).any() and lined < min(0.5, beside.max()):
+        where = f"a line of the picture beside {np.mean(beside > 0.5):.0%} of it"
+        return Rival(where, float(beside.max()), -float(np.abs(moves[beside > 0.5]).max()))
+    return Rival("a line of the picture beside it", lined, float(moved[np.abs(moved).argmax()]))
 
 
 def _spans(place: Array) -> bool:

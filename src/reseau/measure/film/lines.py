@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -32,6 +33,13 @@ _PHASE_PX = 0.04
 _LENGTHS, _TIMES = np.array([0.04, 0.1, 0.25, 0.6]), np.geomspace(0.05, 25.6, 10)
 """Lengths over which departures are alike, in halves of the edge, and sizes of them, in their units: evenly
 distributed in their logarithms."""
+_WAVES = np.array([0.1, 0.2, 0.4])
+"""Lengths of waves of film and gate, which are smooth and do not depend on the picture, likewise."""
+_FROM, _CONTOUR, _AWAY_PX, _DARK = np.linspace(-0.2, 0.7, 6), 0.25, np.array([1.0, 3.0, 9.0]), 0.1
+"""Places from which an end may be hidden by a dark picture; length over which the contour that is seen there
+is alike, and its distances from the edge; and the probability of it."""
+_BOWS = np.geomspace(0.1, 10.0, 5)
+"""Sizes of the bows of edges, pixels, evenly distributed in their logarithm."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +52,7 @@ class Rival:
 
     def __str__(self) -> str:
         way = "inwards" if self.moved_px > 0 else "outwards"
-        moved = f"would move it {abs(self.moved_px):.2g} px {way}"
+        moved = f"{'moves' if self.probability > 0.5 else 'would move'} it {abs(self.moved_px):.2g} px {way}"
         return f"{self.what} (probability {self.probability:.2f}) {moved}"
 
 
@@ -436,65 +444,116 @@ def _lines(
     )
 
 
+class Departing(NamedTuple):
+    """An edge with each of k displacements of its steps.
+
+    Parameters
+    ----------
+    values, covariance : ndarray (k, 3), (k, 3, 3)
+        Start, stop and bow.
+    departs : ndarray (k,)
+        Root mean square of the departures from the line.
+    log : ndarray (k,)
+        Logarithm of the likelihood.
+    """
+
+    values: Array
+    covariance: Array
+    departs: Array
+    log: Array
+
+
 def departing_line(
-    place: Array, offset: Array, sigma: Array, moved: Array, harmonics: Array, curved: Array
-) -> tuple[Array, Array, float, Array]:
+    place: Array,
+    offset: Array,
+    sigma: Array,
+    harmonics: Array,
+    moved: Array,
+    displaced: Array,
+    *,
+    hidden: bool = False,
+) -> Departing:
     """Chord and bow of an edge from which profiles depart, and neighbours alike.
 
     What the picture shows beside an edge displaces its steps over some length along it; film and gate are
     neither straight nor evenly bowed. The departures are a random process along the edge of which size and
-    length are unknown: the mean over them, weighted by their likelihoods (Patterson and Thompson 1971).
+    length are unknown, as is the size of bows: the mean over them, weighted by their likelihoods (Patterson
+    and Thompson 1971).
 
     Parameters
     ----------
     place, offset, sigma : ndarray (n,)
         Positions along the edge (−1 to 1), offsets inwards, and standard deviations by noise.
-    moved : ndarray (n,)
-        Sizes of the departures relative to each other.
     harmonics : ndarray (n, m)
         Functions of the phase of the edge on the pixels, with which its steps are displaced alike.
-    curved : ndarray (n, k)
-        Displacements of the steps by each curve that the grey values may have.
-
-    Returns
-    -------
-    (ndarray (3,), ndarray (3, 3), float, ndarray (k,))
-        Start, stop and bow, their covariance, and the standard deviation of the departures; logarithms of the
-        likelihoods of the curves, over that of none.
+    moved : ndarray (n,)
+        Sizes of the departures relative to each other.
+    displaced : ndarray (n, k)
+        Displacements of the steps by each of k explanations.
+    hidden : bool
+        Whether one end may be hidden: the picture is as dark as film there, and what is seen lies in it.
     """
     order = np.argsort(place, kind="stable")
-    place, offset, sigma, moved, harmonics, curved = (
-        each[order] for each in (place, offset, sigma, moved, harmonics, curved)
+    place, offset, sigma, moved, harmonics, displaced = (
+        each[order] for each in (place, offset, sigma, moved, harmonics, displaced)
     )
     change = np.abs(np.diff(offset)) / np.hypot(sigma[1:], sigma[:-1])
     weight = (max(1.0, 1.4826 * float(np.median(change))) * sigma) ** -2
     part = np.clip(((place + 1) / 2 * _BINS).astype(np.intp), 0, _BINS - 1)
     total = np.bincount(part, weight, minlength=_BINS)
     seen = total > 0
-    columns = (place, np.hypot(moved, _NEAREST_PX), *harmonics.T, offset, *(offset[:, None] - curved).T)
+    columns = (place, np.hypot(moved, _NEAREST_PX), *harmonics.T, *(offset[:, None] - displaced).T)
     t, size, *each = (np.bincount(part, weight * c, minlength=_BINS)[seen] / total[seen] for c in columns)
     phase, last = each[: harmonics.shape[1]], 3 + harmonics.shape[1]
     design = np.stack([(1 - t) / 2, (1 + t) / 2, -(1 - t**2), *each], axis=1)
-    prior = np.diag([1e-6, 1e-6, 1e-4] + [_PHASE_PX**-2] * len(phase))
-    alike = np.exp(-np.abs(t[:, None] - t) / _LENGTHS[:, None, None]) * np.outer(size, size)
-    covariance = (_TIMES[:, None, None, None] ** 2 * alike).reshape(-1, len(t), len(t))
+    prior = np.diag([1e-6, 1e-6, 0.0] + [_PHASE_PX**-2] * len(phase)) + np.zeros((len(_BOWS), 1, 1, 1))
+    prior[:, 0, 2, 2] = _BOWS**-2
+    covariance, likely = _departures(t, size, hidden)
     covariance += np.diag(1 / total[seen])
     root = np.linalg.cholesky(covariance)
     white = np.linalg.solve(root, np.broadcast_to(design, (len(root), *design.shape)))
     white, own = white[..., :last], white[..., last:]
     normal = white.transpose(0, 2, 1) @ white + prior
-    cofactor = np.linalg.inv(normal)
-    every = cofactor @ white.transpose(0, 2, 1) @ own
-    rest = (own**2).sum(axis=1) - (every * (normal @ every)).sum(axis=1)
+    cofactor = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    every = cofactor @ (white.transpose(0, 2, 1) @ own)
+    rest = (own**2).sum(axis=1) - (every * (normal @ every)).sum(axis=2)
     log = -np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1) - np.linalg.slogdet(normal)[1] / 2
-    log = log[:, None] - rest / 2
+    log = (log + likely - np.log(_BOWS)[:, None])[..., None] - rest / 2
+    log = log.reshape(-1, own.shape[2])
     likelihood = scipy.special.logsumexp(log, axis=0)
-    share, found = np.exp(log[:, 0] - likelihood[0]), every[..., 0]
-    mean = share @ found
-    spread = cofactor + (found - mean)[:, :, None] * (found - mean)[:, None, :]
-    departs = np.sqrt(np.repeat(_TIMES**2, len(_LENGTHS)) @ share * np.mean(size**2))
-    curves = np.asarray(likelihood[1:] - likelihood[0])
-    return mean[:3], np.tensordot(share, spread, 1)[:3, :3], float(departs), curves
+    share = np.exp(log - likelihood)
+    found = every[:, :, :3].swapaxes(2, 3).reshape(len(share), -1, 3)
+    mean, spread = mixed(share, found, cofactor[..., :3, :3].reshape(len(share), 1, 3, 3))
+    left = np.stack(each[harmonics.shape[1] :]) - mean @ design[:, :3].T
+    departs = np.sqrt(np.maximum(np.mean(left**2 - 1 / total[seen], axis=1), 0.0))
+    return Departing(mean, spread, departs, likelihood)
+
+
+def _departures(t: Array, size: Array, hidden: bool) -> tuple[Array, Array]:
+    """Covariances (m, n, n) of the departures at places (n,), and logarithms (m,) of their probabilities."""
+    apart, ends = np.abs(t[:, None] - t), np.zeros((0, len(t), len(t)))
+    rough = np.exp(-apart / _LENGTHS[:, None, None]) * np.outer(size, size)
+    smooth = np.exp(-((apart / _WAVES[:, None, None]) ** 2) / 2) * _NEAREST_PX**2
+    every = _TIMES[:, None, None, None] ** 2 * np.concatenate([rough, smooth])
+    likely = np.full(every.shape[0] * every.shape[1], -np.log(every.shape[0] * every.shape[1]))
+    if hidden:
+        inside = np.concatenate([t > _FROM[:, None], t < -_FROM[:, None]])
+        # A contour that leaves the edge, and what else is as rough as everywhere.
+        alike = np.exp(-((apart / _CONTOUR) ** 2) / 2) + 0.1 * np.exp(-apart / _LENGTHS[1])
+        away = inside[:, :, None] * inside[:, None] * alike
+        ends = _AWAY_PX[:, None, None, None, None] ** 2 * away + every[1::3, None, 1]
+        ends = ends.reshape(-1, *apart.shape)
+        likely = np.append(likely, np.full(len(ends), np.log(_DARK / len(ends))))
+    return np.concatenate([every.reshape(-1, *apart.shape), ends]), likely
+
+
+def mixed(share: Array, values: Array, covariance: Array) -> tuple[Array, Array]:
+    """Means and covariances of mixtures over the first axis, of which the parts have the given ones."""
+    weighted = share[..., None] * values
+    mean = weighted.sum(axis=0)
+    within = (share[..., None, None] * covariance).sum(axis=0)
+    square = np.moveaxis(weighted, 0, -1) @ np.moveaxis(values - mean, 0, -2)
+    return mean, within + square
 
 
 def derived(corners: Array, covariance: Array) -> tuple[Array, Array, float, float]:
