@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 
 from reseau.core.data import Array
 from reseau.core.failure import Code
@@ -20,7 +21,9 @@ from reseau.measure.film.lines import (
     FrameShape,
     Lines,
     departing_line,
+    departures_of,
     explained_shape,
+    mixed,
     robust_line,
 )
 from reseau.measure.film.orientation import FrameOptions, FrameResult
@@ -449,13 +452,18 @@ def test_grey_values_are_measured_with_the_curve_that_the_file_states_or_the_edg
 def test_ends_of_a_wavy_edge_are_as_uncertain_as_it_departs_from_a_line() -> None:
     place, sigma = np.linspace(-1, 1, 300), np.full(300, 0.05)
     noise = np.random.default_rng(0).normal(0, 0.05, 300)
-    none = np.zeros((300, 0)), np.zeros(300), np.zeros((300, 1))
-    _, (covariance,), (departs,), _ = departing_line(place, noise, sigma, *none)
+
+    def line(offset: Array) -> tuple[Array, Array, float]:
+        none = np.zeros((300, 0)), np.zeros(300), np.zeros((300, 1))
+        values, covariance, log = (each[:, 0] for each in departing_line(place, offset, sigma, *none))
+        values, covariance = mixed(np.exp(log - logsumexp(log)), values, covariance)
+        return values, covariance, departures_of(values, place, offset, sigma)
+
+    _, covariance, departs = line(noise)
     assert departs < 0.03
     assert np.sqrt(np.diag(covariance))[:2].max() < 0.03
     # A line through one wave of 0.5 px, weighted evenly, misses its ends by 0.48 px.
-    wavy = noise + 0.5 * np.sin(np.pi * place)
-    (values,), (covariance,), (departs,), _ = departing_line(place, wavy, sigma, *none)
+    values, covariance, departs = line(noise + 0.5 * np.sin(np.pi * place))
     assert 0.1 < departs < 0.5
     assert (np.abs(values[:2]) < 2 * np.sqrt(np.diag(covariance))[:2]).all()
     assert np.abs(values[:2]).max() < 0.2

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -14,7 +15,7 @@ from .adjacent_lines import Softness, beside_edge, common_forms, soft_steps
 from .border import Band, Border, Film
 from .curves import CurveEvidence, probabilities_of
 from .edges import EdgeProfiles, measure_profiles, merged
-from .lines import Contender, EdgeData, Rival, departing_line, mixed, robust_line
+from .lines import Contender, EdgeData, Rival, bows_alike, departing_line, departures_of, mixed, robust_line
 from .steps import Developed, StepForm, Tone
 
 _NEIGHBOURHOOD_PX = 0.05
@@ -220,9 +221,11 @@ def _measured(
         _edge(band(k, False, far[k]), found, soft, forms, taken)
         for k, (found, soft) in enumerate(zip(profiles, soft_steps(profiles, side), strict=True))
     ]
-    data, rejected, why = (list(column) for column in zip(*edges, strict=True))
+    bows = bows_alike([each.bows for each in edges])
+    data = [edge.finished and edge.finished(own) for edge, own in zip(edges, bows, strict=True)]
     borders = [None if found is None else found.border for found in profiles]
     width = float(np.median([found.width for found in profiles if found is not None] or [1.0]))
+    rejected, why = [each.rejected for each in edges], [each.why for each in edges]
     return Channel(name, channel, polarity, borders, width, data, rejected, why)
 
 
@@ -238,18 +241,31 @@ def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
     return [film if p is None or p.border.film.tone - film.tone > most else None for p in profiles]
 
 
+class _Edge(NamedTuple):
+    """An edge before the bows of all are compared: why it is missing, and the number of rejected profiles.
+
+    If it is found, the logarithm (b,) of the likelihood of each size of bows, and the edge as a function of
+    the logarithms of their probabilities.
+    """
+
+    why: str
+    rejected: int = 0
+    bows: Array | None = None
+    finished: Callable[[Array], EdgeData] | None = None
+
+
 def _edge(
     band: Band | None,
     found: EdgeProfiles | None,
     soft: Softness,
     forms: Sequence[Tone | Developed],
     taken: int,
-) -> tuple[EdgeData | None, int, str]:
+) -> _Edge:
     """Profiles of an edge that agree with its line, or the reason why it is not found."""
     if band is None:
-        return None, 0, "is not in the scan, or nothing separates it from the picture"
+        return _Edge("is not in the scan, or nothing separates it from the picture")
     if found is None:
-        return None, 0, "no contrast between film and picture"
+        return _Edge("no contrast between film and picture")
     around = beside_edge(found, soft, float(np.hypot(*(band.stop - band.start))))
     beside, moved = around.share[found.good], around.moved.T[found.good]
     drawn, of_line = around.scatter[:, found.good]
@@ -258,13 +274,13 @@ def _edge(
     line = _line(place, offset, sigma, own)
     rejected = int((~found.good).sum())
     if line is None:
-        return None, rejected, f"no line fits {len(place)} of {len(found.place)} profiles that show a step"
+        return _Edge(f"no line fits {len(place)} of {len(found.place)} profiles that show a step", rejected)
     near, agree, doubt = line
     if agree.sum() < max(12, 0.1 * len(found.place)) or agree.mean() < _LEAST_AGREE:
-        return None, rejected, f"only {int(agree.sum())} of {len(found.place)} profiles agree with a line"
+        return _Edge(f"only {int(agree.sum())} of {len(found.place)} profiles agree with a line", rejected)
     border = found.border
     if border.clean < 0.6:
-        return None, rejected, "there is no unexposed film beyond it; frames may overlap"
+        return _Edge("there is no unexposed film beyond it; frames may overlap", rejected)
     # An error of the film's tone moves a step by √(2π) of its width, times the error relative to the
     # contrast.
     common = float(np.sqrt(2 * np.pi) * found.width * _TONE * border.noise / border.contrast)
@@ -280,31 +296,39 @@ def _edge(
     steps = place[used], offset[used], own[used], harmonics[used]
     parts = departing_line(*steps, drawn[used], np.insert(curved[used], 0, 0.0, axis=1), hidden=True)
     lines = departing_line(*steps, of_line[used], (moved[:, 1:] - moved[:, :1])[used])
-    log = around.log + np.append(parts.log[0], lines.log)
-    share = np.exp(log - scipy.special.logsumexp(log))
-    ends = np.concatenate([parts.values[:1], lines.values])
-    values, covariance = mixed(share, ends, np.concatenate([parts.covariance[:1], lines.covariance]))
-    lined = float(share[1:].sum())
-    rival = _rival(beside, moved[:, 0], lined, (share[1:] @ lines.values / max(lined, 1e-12) - ends[0])[:2])
-    # With a line beside it, the edge says nothing about the curve.
-    likelihood = np.log(lined + share[0] * np.exp(np.minimum(parts.log[1:] - parts.log[0], 600.0)))
-    shown = np.stack([likelihood, -np.median(curved[used], axis=0)], axis=1)
-    # Steps that are too sharp belong to a scratch and are equally uninformative.
-    square = doubt**2 + soft.sharpened * soft.width**2
-    covariance[:2, :2] += common**2 + (_MODEL_PX**2 + square) * np.eye(2)
-    doubt = float(np.sqrt(square + share @ ((ends - values) ** 2)[:, :2].mean(axis=1)))
-    rest = _inward(values, place[used], offset[used])
-    data = EdgeData(
-        values,
-        covariance,
-        band.at(place[used], offset[used]),
-        rest,
-        float(parts.departs[0]),
-        doubt,
-        rival,
-        shown,
-    )
-    return data, rejected + int((~used).sum()), ""
+    log = around.log + np.concatenate([parts.log[:, :1], lines.log], axis=1)
+    ends = np.concatenate([parts.values[:, :1], lines.values], axis=1)
+    covariances = np.concatenate([parts.covariance[:, :1], lines.covariance], axis=1)
+
+    def finished(bows: Array) -> EdgeData:
+        """The edge, with the probabilities of the sizes of bows as logarithms (b,)."""
+        each = (log + bows[:, None]).ravel()
+        share = np.exp(each - scipy.special.logsumexp(each))
+        values, covariance = mixed(share, ends.reshape(-1, 3), covariances.reshape(-1, 3, 3))
+        lined = float(share.reshape(log.shape)[:, 1:].sum())
+        with_line, without = (
+            np.tensordot(np.exp(part - scipy.special.logsumexp(part)), at, 2)[:2]
+            for part, at in (((log + bows[:, None])[:, k], ends[:, k]) for k in (slice(1, None), slice(1)))
+        )
+        # With a line beside it, the edge says nothing about the curve.
+        of_curves = scipy.special.logsumexp(parts.log + bows[:, None], axis=0)
+        likelihood = np.log(lined + (1 - lined) * np.exp(np.minimum(of_curves[1:] - of_curves[0], 600.0)))
+        # Steps that are too sharp belong to a scratch and are equally uninformative.
+        square = doubt**2 + soft.sharpened * soft.width**2
+        covariance[:2, :2] += common**2 + (_MODEL_PX**2 + square) * np.eye(2)
+        return EdgeData(
+            values,
+            covariance,
+            band.at(place[used], offset[used]),
+            _inward(values, place[used], offset[used]),
+            departures_of(values, place[used], offset[used], own[used]),
+            float(np.sqrt(square + share @ ((ends.reshape(-1, 3) - values) ** 2)[:, :2].mean(axis=1))),
+            _rival(beside, moved[:, 0], lined, with_line - without),
+            np.stack([likelihood, -np.median(curved[used], axis=0)], axis=1),
+        )
+
+    bows = np.asarray(scipy.special.logsumexp(log, axis=1))
+    return _Edge("", rejected + int((~used).sum()), bows, finished)
 
 
 def _curved(found: EdgeProfiles, forms: Sequence[Tone | Developed], taken: int) -> Array:

@@ -22,8 +22,8 @@ from ...core.failure import Code, Failure
 from ...io import EDGES
 from .search import frame_axes, moved
 
-_BOW_PX, _LEAST_BOW_PX = 3.0, 0.2
-"""Prior standard deviation of the bow of an edge in pixels, and its minimum once bows are measured."""
+_BOW_PX = 3.0
+"""Prior standard deviation of the bow of an edge in pixels, before bows are compared."""
 _LEAST_SCALE = 0.3
 """Scatter of residuals over sigmas below which sigmas as given decide which profiles agree."""
 _BINS, _NEAREST_PX = 48, 0.05
@@ -39,7 +39,9 @@ _FROM, _CONTOUR, _AWAY_PX, _DARK = np.linspace(-0.2, 0.7, 6), 0.25, np.array([1.
 """Places from which an end may be hidden by a dark picture; length over which the contour that is seen there
 is alike, and its distances from the edge; and the probability of it."""
 _BOWS = np.geomspace(0.1, 10.0, 5)
-"""Sizes of the bows of edges, pixels, evenly distributed in their logarithm."""
+_ODD = 0.05
+"""Sizes of the bows of edges, pixels, evenly distributed in their logarithm; and the probability that an edge
+is not bowed like the others."""
 
 
 @dataclass(frozen=True)
@@ -222,11 +224,7 @@ def adjust_lines(
         return Failure(
             "fewer than three edges of a known format, or than four of an unknown one", Code.NOT_FOUND
         )
-    first = adjust(_problem(corners, edges, shape, _BOW_PX), _APRIORI)
-    if isinstance(first, Failure):
-        return first
-    bow = _bow_of(first.values[2:12:3], first.sigma[2:12:3])
-    fit = adjust(_problem(corners, edges, shape, bow), _APRIORI)
+    fit = adjust(_problem(corners, edges, shape), _APRIORI)
     return fit if isinstance(fit, Failure) else _lines(fit, corners, edges, rejected)
 
 
@@ -341,19 +339,6 @@ _APRIORI = Options(scale="a-priori")
 _NAMES = tuple(f"{edge}.{what}" for edge in ("upper", "right", "lower", "left") for what in ("a", "b", "bow"))
 
 
-def _bow_of(bow: Array, sigma: Array) -> float:
-    """Prior standard deviation of the bows, from the estimated bows.
-
-    A partly visible edge is assumed to be bowed about as much as the others, which are determined well.
-    """
-    known = sigma < 0.5 * _BOW_PX
-    if not known.any():
-        return _BOW_PX
-    weight = 1 / (sigma[known] ** 2 + _LEAST_BOW_PX**2)
-    variance = float((weight * (bow[known] ** 2 - sigma[known] ** 2)).sum() / weight.sum())
-    return float(np.clip(1.5 * np.sqrt(max(variance, 0.0)), _LEAST_BOW_PX, _BOW_PX))
-
-
 def _corners(values: Array, corners: Array) -> Array:
     """Corners of the adjusted chords."""
     return moved(corners, values[:12].reshape(4, 3)[:, :2])
@@ -369,9 +354,7 @@ def shape_of(corners: Array, shape: FrameShape) -> Array:
     return np.array([*(turn[1:] - np.pi / 2), aspect])
 
 
-def _problem(
-    corners: Array, edges: Sequence[EdgeData | None], shape: FrameShape | None, bow: float
-) -> GaussMarkov:
+def _problem(corners: Array, edges: Sequence[EdgeData | None], shape: FrameShape | None) -> GaussMarkov:
     """Observations of the edges, three for each, followed by those of the shape."""
     rows, observed = [], []
     for k, edge in enumerate(edges):
@@ -400,7 +383,7 @@ def _problem(
         slope = [(of_shape(x + step * e) - of_shape(x - step * e)) / (2 * step) for e in np.eye(len(x))]
         return np.concatenate([design, np.stack(slope, axis=1)])
 
-    prior = {name: bow for name in _NAMES if name.endswith("bow")}
+    prior = {name: _BOW_PX for name in _NAMES if name.endswith("bow")}
     parameters = Parameters(_NAMES, np.zeros(len(_NAMES)), prior_sigma=prior)
     return GaussMarkov(function, np.concatenate(observed), np.concatenate(sigma), parameters, jacobian)
 
@@ -445,21 +428,18 @@ def _lines(
 
 
 class Departing(NamedTuple):
-    """An edge with each of k displacements of its steps.
+    """An edge with each of k displacements of its steps, for each of b sizes of bows.
 
     Parameters
     ----------
-    values, covariance : ndarray (k, 3), (k, 3, 3)
+    values, covariance : ndarray (b, k, 3), (b, k, 3, 3)
         Start, stop and bow.
-    departs : ndarray (k,)
-        Root mean square of the departures from the line.
-    log : ndarray (k,)
+    log : ndarray (b, k)
         Logarithm of the likelihood.
     """
 
     values: Array
     covariance: Array
-    departs: Array
     log: Array
 
 
@@ -477,8 +457,8 @@ def departing_line(
 
     What the picture shows beside an edge displaces its steps over some length along it; film and gate are
     neither straight nor evenly bowed. The departures are a random process along the edge of which size and
-    length are unknown, as is the size of bows: the mean over them, weighted by their likelihoods (Patterson
-    and Thompson 1971).
+    length are unknown: the mean over them, weighted by their likelihoods (Patterson and Thompson 1971), for
+    each of the sizes that bows may have.
 
     Parameters
     ----------
@@ -519,14 +499,42 @@ def departing_line(
     rest = (own**2).sum(axis=1) - (every * (normal @ every)).sum(axis=2)
     log = -np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1) - np.linalg.slogdet(normal)[1] / 2
     log = (log + likely - np.log(_BOWS)[:, None])[..., None] - rest / 2
-    log = log.reshape(-1, own.shape[2])
-    likelihood = scipy.special.logsumexp(log, axis=0)
-    share = np.exp(log - likelihood)
-    found = every[:, :, :3].swapaxes(2, 3).reshape(len(share), -1, 3)
-    mean, spread = mixed(share, found, cofactor[..., :3, :3].reshape(len(share), 1, 3, 3))
-    left = np.stack(each[harmonics.shape[1] :]) - mean @ design[:, :3].T
-    departs = np.sqrt(np.maximum(np.mean(left**2 - 1 / total[seen], axis=1), 0.0))
-    return Departing(mean, spread, departs, likelihood)
+    likelihood = scipy.special.logsumexp(log, axis=1)
+    share = np.exp(log - likelihood[:, None]).swapaxes(0, 1)
+    found = every[:, :, :3].transpose(1, 0, 3, 2)
+    mean, spread = mixed(share, found, cofactor[..., :3, :3].swapaxes(0, 1)[:, :, None])
+    return Departing(mean, spread, likelihood)
+
+
+def departures_of(line: Array, place: Array, offset: Array, sigma: Array) -> float:
+    """Root mean square of the departures of an edge from its line, without noise, pixels."""
+    part = np.clip(((place + 1) / 2 * _BINS).astype(np.intp), 0, _BINS - 1)
+    total = np.bincount(part, sigma**-2, minlength=_BINS)
+    rest = offset - (line[0] * (1 - place) + line[1] * (1 + place)) / 2 + line[2] * (1 - place**2)
+    seen = total > 0
+    mean = np.bincount(part, rest * sigma**-2, minlength=_BINS)[seen] / total[seen]
+    return float(np.sqrt(np.maximum(np.mean(mean**2 - 1 / total[seen]), 0.0)))
+
+
+def bows_alike(logs: Sequence[Array | None]) -> list[Array]:
+    """Logarithms (b,) of the probabilities of the sizes of bows for each edge, by the other edges.
+
+    The edges of a frame are bowed alike, by film, gate and lens; one of them may be odd. `logs` are the
+    logarithms of their likelihoods.
+    """
+    found = []
+    for k in range(len(logs)):
+        others = sum(
+            (_odd(each) for i, each in enumerate(logs) if i != k and each is not None), np.zeros(len(_BOWS))
+        )
+        found.append(_odd(others))
+    return found
+
+
+def _odd(log: Array) -> Array:
+    """Logarithms of probabilities, normalised, of which an edge may be odd."""
+    share = np.exp(log - scipy.special.logsumexp(log))
+    return np.asarray(np.log((1 - _ODD) * share + _ODD / len(share)))
 
 
 def _departures(t: Array, size: Array, hidden: bool) -> tuple[Array, Array]:
