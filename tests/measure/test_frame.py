@@ -457,7 +457,8 @@ def test_ends_of_a_wavy_edge_are_as_uncertain_as_it_departs_from_a_line() -> Non
         none = np.zeros((300, 0)), np.zeros(300), np.zeros((300, 1))
         values, covariance, log = (each[:, 0] for each in departing_line(place, offset, sigma, *none))
         values, covariance = mixed(np.exp(log - logsumexp(log)), values, covariance)
-        return values, covariance, departures_of(values, place, offset, sigma)
+        rest = offset - (values[0] * (1 - place) + values[1] * (1 + place)) / 2 + values[2] * (1 - place**2)
+        return values, covariance, departures_of(place, rest, sigma)
 
     _, covariance, departs = line(noise)
     assert departs < 0.03

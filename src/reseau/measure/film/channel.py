@@ -316,12 +316,13 @@ def _edge(
         # Steps that are too sharp belong to a scratch and are equally uninformative.
         square = doubt**2 + soft.sharpened * soft.width**2
         covariance[:2, :2] += common**2 + (_MODEL_PX**2 + square) * np.eye(2)
+        rest = _inward(values, place[used], offset[used])
         return EdgeData(
             values,
             covariance,
             band.at(place[used], offset[used]),
-            _inward(values, place[used], offset[used]),
-            departures_of(values, place[used], offset[used], own[used]),
+            rest,
+            departures_of(place[used], rest, own[used]),
             float(np.sqrt(square + share @ ((ends.reshape(-1, 3) - values) ** 2)[:, :2].mean(axis=1))),
             _rival(beside, moved[:, 0], lined, with_line - without),
             np.stack([likelihood, -np.median(curved[used], axis=0)], axis=1),

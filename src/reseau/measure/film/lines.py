@@ -506,11 +506,10 @@ def departing_line(
     return Departing(mean, spread, likelihood)
 
 
-def departures_of(line: Array, place: Array, offset: Array, sigma: Array) -> float:
-    """Root mean square of the departures of an edge from its line, without noise, pixels."""
+def departures_of(place: Array, rest: Array, sigma: Array) -> float:
+    """Root mean square of the distances of an edge from its line, without noise, pixels."""
     part = np.clip(((place + 1) / 2 * _BINS).astype(np.intp), 0, _BINS - 1)
     total = np.bincount(part, sigma**-2, minlength=_BINS)
-    rest = offset - (line[0] * (1 - place) + line[1] * (1 + place)) / 2 + line[2] * (1 - place**2)
     seen = total > 0
     mean = np.bincount(part, rest * sigma**-2, minlength=_BINS)[seen] / total[seen]
     return float(np.sqrt(np.maximum(np.mean(mean**2 - 1 / total[seen]), 0.0)))
