@@ -13,8 +13,8 @@ from reseau.core.data import Array
 from reseau.core.failure import Code
 from reseau.core.tone import ToneCurve
 from reseau.io.scans import scan_of
-from reseau.measure.film import orient_frames
-from reseau.measure.film.adjacent_lines import softness_of
+from reseau.measure.film import channel, orient_frames
+from reseau.measure.film.adjacent_lines import Softness, softness_of
 from reseau.measure.film.curves import curves_of_roll
 from reseau.measure.film.lines import (
     EdgeData,
@@ -509,6 +509,16 @@ def test_frames_of_a_strip_are_delivered_in_order() -> None:
     found = orient_frames(scan_of(np.hstack([each[:rows] for each in frames]), dpi=FilmFrame(40).dpi))
     assert [each.frame for each in found] == [1, 2]
     assert all(found)
+
+
+def test_edges_whose_softness_too_few_profiles_show_are_measured_without_lines(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(channel, "soft_steps", lambda profiles, side: [Softness(0.0)] * len(profiles))
+    frame = FilmFrame(1, dpi=100)
+    result = oriented(frame)
+    assert result.status == "oriented", result.why
+    assert np.abs(errors(result, frame)).max() < 0.35
 
 
 def test_the_softness_of_edges_is_explained_together() -> None:

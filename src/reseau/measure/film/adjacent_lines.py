@@ -265,7 +265,7 @@ def beside_edge(found: EdgeProfiles, soft: Softness, side: float) -> Beside:
     n, good = len(found.place), np.flatnonzero(found.good)
     groups = [g for g in np.array_split(good, max(1, n // NEIGHBOURS)) if len(g)]
     if not groups or soft.before <= 0:
-        return Beside(np.zeros(n), np.zeros((2, n)), np.zeros((1, n)), np.zeros(1))
+        return Beside(np.zeros(n), np.zeros((2, n)), np.zeros((2, n)), np.array([0.0, -np.inf]))
     weight = 1 / (found.blur[1] + _EVEN**2)
     width = np.array([np.average(found.blur[0][g], weights=weight[g]) for g in groups])
     # The texture was seen with the noise in it.

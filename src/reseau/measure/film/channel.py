@@ -305,11 +305,14 @@ def _edge(
         each = (log + bows[:, None]).ravel()
         share = np.exp(each - scipy.special.logsumexp(each))
         values, covariance = mixed(share, ends.reshape(-1, 3), covariances.reshape(-1, 3, 3))
-        lined = float(share.reshape(log.shape)[:, 1:].sum())
-        with_line, without = (
-            np.tensordot(np.exp(part - scipy.special.logsumexp(part)), at, 2)[:2]
-            for part, at in (((log + bows[:, None])[:, k], ends[:, k]) for k in (slice(1, None), slice(1)))
-        )
+        by_line = share.reshape(log.shape)
+        lined = float(by_line[:, 1:].sum())
+
+        def middle(some: slice) -> Array:
+            total = by_line[:, some].sum()
+            return np.tensordot(by_line[:, some], ends[:, some], 2) / total if total > 0 else values
+
+        moved_by = (middle(slice(1, None)) - middle(slice(1)))[:2]
         # With a line beside it, the edge says nothing about the curve.
         of_curves = scipy.special.logsumexp(parts.log + bows[:, None], axis=0)
         likelihood = np.log(lined + (1 - lined) * np.exp(np.minimum(of_curves[1:] - of_curves[0], 600.0)))
@@ -324,7 +327,7 @@ def _edge(
             rest,
             departures_of(place[used], rest, own[used]),
             float(np.sqrt(square + share @ ((ends.reshape(-1, 3) - values) ** 2)[:, :2].mean(axis=1))),
-            _rival(beside, moved[:, 0], lined, with_line - without),
+            _rival(beside, moved[:, 0], lined, moved_by),
             np.stack([likelihood, -np.median(curved[used], axis=0)], axis=1),
         )
 
