@@ -94,6 +94,8 @@ def estimate_optics(
     varied : Varied
         The parameters with their prior standard deviations.
     options : BlurredOptions, optional
+        Without a number of rings, the values are estimated with few rays, and then with as many as the images
+        need.
     start : ndarray (p,), optional
         Values from which corrections begin; by default zeros.
     halves : dict of int to int, optional
@@ -120,13 +122,27 @@ def estimate_optics(
     >>> estimate_optics(frame, [disk], focus).values.round(2)
     array([0.1])
     """
-    # The same rays and pixels throughout, so that sums of squares can be compared.
-    chosen, halves = options or BlurredOptions(), {} if halves is None else halves
-    chosen = replace(chosen, varied=None, rings=chosen.rings or RINGS[0])
-    prior = np.diag(1 / np.square(varied.sigma))
+    chosen, halves = replace(options or BlurredOptions(), varied=None), {} if halves is None else halves
     values = np.zeros(len(varied.names)) if start is None else start
-    equations = partial(_Common.of, frame, tuple(targets), varied, chosen, halves)
-    at = equations(values)
+
+    def estimated(rings: int, values: Array) -> EstimatedOptics | Failure:
+        """The same rays and pixels throughout, so that sums of squares can be compared."""
+        few = replace(chosen, rings=rings)
+        return _estimated(varied, partial(_Common.of, frame, tuple(targets), varied, few, halves), values)
+
+    found = estimated(chosen.rings or RINGS[0], values)
+    if isinstance(found, Failure) or chosen.rings:
+        return found
+    needed = Run(frame, found.camera, ("",) * len(targets), tuple(targets), chosen).result().rings
+    finer = estimated(needed, found.values) if needed > RINGS[0] else found
+    return found if isinstance(finer, Failure) else finer
+
+
+def _estimated(
+    varied: Varied, equations: Callable[[Array], _Common], values: Array
+) -> EstimatedOptics | Failure:
+    """Parameters from the normal equations of all targets for their values."""
+    prior, at = np.diag(1 / np.square(varied.sigma)), equations(values)
     damping = _DAMPING
     for _ in range(_ROUNDS):
         if not at.costs:

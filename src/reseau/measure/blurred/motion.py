@@ -397,17 +397,10 @@ class _Compared:
 
     def finest(self, reason: Explained) -> tuple[Explained, bool]:
         """The explanation by as many rays as images need, and whether nothing is left to explain."""
-        found = self._measured(reason)
-        if found.rings > (self.options.rings or 0):
-            finer = self.fitted(reason.kind, reason, replace(self.options, rings=found.rings))
-            if finer is not None:
-                reason, found = finer, self._measured(finer)
+        reason = self.fitted(reason.kind, reason, self.settled) or reason
+        names, camera = ("",) * len(self.targets), reason.optics.camera
+        found = measure_blurred(self.frame, camera, names, self.targets, self.settled)
         return reason, bool(found.ok.any()) and not found.notes
-
-    def _measured(self, reason: Explained) -> BlurredResult:
-        """The targets by as many rays as their images need."""
-        names = ("",) * len(self.targets)
-        return measure_blurred(self.frame, reason.optics.camera, names, self.targets, self.settled)
 
     def gain(self, small: Explained, large: Explained) -> float:
         """By how much the logarithm of the likelihood of the larger explanation is better than it costs."""
