@@ -131,6 +131,12 @@ def student(value: Array, scale: Array | float) -> Array:
     return np.asarray(0.375 / (square * square * np.sqrt(square) * scale))
 
 
+def normalised(log: Array) -> tuple[Any, Array]:
+    """Sum of probabilities over the first axis, as a logarithm, and their shares of it."""
+    total = scipy.special.logsumexp(log, axis=0)
+    return total, np.exp(log - total)
+
+
 def softness_of(widths: Sequence[tuple[float, float] | None], side: float) -> list[Softness]:
     """Explain the widths of the steps of four edges together.
 
@@ -279,7 +285,7 @@ def beside_edge(found: EdgeProfiles, soft: Softness, side: float) -> Beside:
     each = share * student(excess[..., None] - increase, scale[:, None])
     prior, total = max(soft.beside, soft.lined), each.sum(axis=2)
     seen, log = _chain(np.stack([student(excess, scale), total], axis=2), np.array([1 - prior, prior]))
-    evidence, of_base = _normalised(log + known)
+    evidence, of_base = normalised(log + known)
     part = of_base @ seen[..., 1]
     mean, square = ((of_base * unit**k) @ (seen[..., 1] * (each @ displaced**k) / total) for k in (1, 2))
 
@@ -288,11 +294,11 @@ def beside_edge(found: EdgeProfiles, soft: Softness, side: float) -> Beside:
     variance = 1 + _SHARES * (1 - _SHARES) * away[..., None] ** 2
     increase = 0.5 * np.log(np.maximum(variance, _LEAST_SQUARE))
     seen, log = _chain(student(excess[:, None, :, None] - increase, scale[:, None]), _EVENLY)
-    lines, of_base = _normalised(log + known[:, None] + prior_of)
+    lines, of_base = normalised(log + known[:, None] + prior_of)
     means, squares = (
         away**k * np.einsum("bh,bhg->hg", of_base * unit[:, None] ** k, seen @ _SHARES**k) for k in (1, 2)
     )
-    scatter = np.stack([square - mean**2, _normalised(lines)[1] @ (squares - means**2)])
+    scatter = np.stack([square - mean**2, normalised(lines)[1] @ (squares - means**2)])
     at = partial(np.interp, found.place, place)
     return Beside(
         np.asarray(at(part)),
@@ -314,12 +320,6 @@ def _lines_along(place: Array, soft: Softness, side: float) -> tuple[Array, Arra
     away = np.where((away > 0) & (away < _SEEN), away, 0.0)
     beside = away.any(axis=1)
     return prior[beside], away[beside]
-
-
-def _normalised(log: Array) -> tuple[Any, Array]:
-    """Sum of probabilities over the first axis, as a logarithm, and their shares of it."""
-    total = scipy.special.logsumexp(log, axis=0)
-    return total, np.exp(log - total)
 
 
 def _chain(seen: Array, prior: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Mask
-from .adjacent_lines import Softness, beside_edge, common_forms, soft_steps
+from .adjacent_lines import Softness, beside_edge, common_forms, normalised, soft_steps
 from .border import Band, Border, Film
 from .curves import CurveEvidence, probabilities_of
 from .edges import EdgeProfiles, measure_profiles, merged
@@ -303,7 +303,7 @@ def _edge(
     def finished(bows: Array) -> EdgeData:
         """The edge, with the probabilities of the sizes of bows as logarithms (b,)."""
         each = (log + bows[:, None]).ravel()
-        share = np.exp(each - scipy.special.logsumexp(each))
+        share = normalised(each)[1]
         values, covariance = mixed(share, ends.reshape(-1, 3), covariances.reshape(-1, 3, 3))
         by_line = share.reshape(log.shape)
         lined = float(by_line[:, 1:].sum())

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from ...adjust import Adjustment, GaussMarkov, Options, Parameters, adjust
 from ...adjust.outliers import robust
-from ...core.data import Array, Mask
+from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
 from ...io import EDGES
+from .adjacent_lines import normalised
 from .search import frame_axes, moved
 
 _BOW_PX = 3.0
@@ -479,7 +479,7 @@ def departing_line(
     )
     change = np.abs(np.diff(offset)) / np.hypot(sigma[1:], sigma[:-1])
     weight = (max(1.0, 1.4826 * float(np.median(change))) * sigma) ** -2
-    part = np.clip(((place + 1) / 2 * _BINS).astype(np.intp), 0, _BINS - 1)
+    part = _sections(place)
     total = np.bincount(part, weight, minlength=_BINS)
     seen = total > 0
     columns = (place, np.hypot(moved, _NEAREST_PX), *harmonics.T, *(offset[:, None] - displaced).T)
@@ -499,16 +499,20 @@ def departing_line(
     rest = (own**2).sum(axis=1) - (every * (normal @ every)).sum(axis=2)
     log = -np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1) - np.linalg.slogdet(normal)[1] / 2
     log = (log + likely - np.log(_BOWS)[:, None])[..., None] - rest / 2
-    likelihood = scipy.special.logsumexp(log, axis=1)
-    share = np.exp(log - likelihood[:, None]).swapaxes(0, 1)
+    likelihood, share = normalised(log.swapaxes(0, 1))
     found = every[:, :, :3].transpose(1, 0, 3, 2)
     mean, spread = mixed(share, found, cofactor[..., :3, :3].swapaxes(0, 1)[:, :, None])
     return Departing(mean, spread, likelihood)
 
 
+def _sections(place: Array) -> Rows:
+    """Sections (n,) in which profiles are averaged."""
+    return np.clip(((place + 1) / 2 * _BINS).astype(np.intp), 0, _BINS - 1)
+
+
 def departures_of(place: Array, rest: Array, sigma: Array) -> float:
     """Root mean square of the distances of an edge from its line, without noise, pixels."""
-    part = np.clip(((place + 1) / 2 * _BINS).astype(np.intp), 0, _BINS - 1)
+    part = _sections(place)
     total = np.bincount(part, sigma**-2, minlength=_BINS)
     seen = total > 0
     mean = np.bincount(part, rest * sigma**-2, minlength=_BINS)[seen] / total[seen]
@@ -521,18 +525,13 @@ def bows_alike(logs: Sequence[Array | None]) -> list[Array]:
     The edges of a frame are bowed alike, by film, gate and lens; one of them may be odd. `logs` are the
     logarithms of their likelihoods.
     """
-    found = []
-    for k in range(len(logs)):
-        others = sum(
-            (_odd(each) for i, each in enumerate(logs) if i != k and each is not None), np.zeros(len(_BOWS))
-        )
-        found.append(_odd(others))
-    return found
+    shown = np.array([np.zeros(len(_BOWS)) if each is None else _odd(each) for each in logs])
+    return [_odd(others) for others in shown.sum(axis=0) - shown]
 
 
 def _odd(log: Array) -> Array:
     """Logarithms of probabilities, normalised, of which an edge may be odd."""
-    share = np.exp(log - scipy.special.logsumexp(log))
+    share = normalised(log)[1]
     return np.asarray(np.log((1 - _ODD) * share + _ODD / len(share)))
 
 
@@ -548,7 +547,8 @@ def _departures(t: Array, size: Array, hidden: bool) -> tuple[Array, Array]:
         # A contour that leaves the edge, and what else is as rough as everywhere.
         alike = np.exp(-((apart / _CONTOUR) ** 2) / 2) + 0.1 * np.exp(-apart / _LENGTHS[1])
         away = inside[:, :, None] * inside[:, None] * alike
-        ends = _AWAY_PX[:, None, None, None, None] ** 2 * away + every[1::3, None, 1]
+        everywhere = every[1::3, 1]  # of one length, in a few sizes
+        ends = _AWAY_PX[:, None, None, None, None] ** 2 * away + everywhere[:, None]
         ends = ends.reshape(-1, *apart.shape)
         likely = np.append(likely, np.full(len(ends), np.log(_DARK / len(ends))))
     return np.concatenate([every.reshape(-1, *apart.shape), ends]), likely
